@@ -1,0 +1,61 @@
+# make help lists the targets. Needs Python 3.11 or newer and git; everything else is installed into .venv.
+SHELL := /bin/bash
+.SHELLFLAGS := -eu -o pipefail -c
+.DEFAULT_GOAL := help
+
+PYTHON ?= python3
+BIN := .venv/bin
+STAMP := .venv/.installed
+# Workers of the test run. One thread each: the fast suite is many small tensors.
+WORKERS ?= 2
+APT := mesa-vulkan-drivers libegl1 libegl-mesa0 libgl1-mesa-dri libosmesa6
+
+export PIP_DISABLE_PIP_VERSION_CHECK := 1
+
+.PHONY: help setup system demo test test-all check format clean
+
+help: ## List the targets.
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+
+setup: $(STAMP) ## Create .venv and install everything (once).
+
+# uv is several times faster than pip with wheels of this size; it is told about pip's own index settings, if there are any.
+$(STAMP): requirements.lock pyproject.toml
+	@$(PYTHON) -c 'import sys; v = sys.version_info; sys.exit(None if v >= (3, 11) else f"error: Python 3.11 or newer is needed, {v[0]}.{v[1]} found; say which: make setup PYTHON=python3.11")'
+	@[ -x $(BIN)/python ] || { echo "creating .venv"; $(PYTHON) -m venv .venv; }
+	@echo "installing $$(wc -l < requirements.lock) packages into .venv (a few GB, once)"
+	@$(BIN)/python -m pip install -q uv
+	@UV_HTTP_TIMEOUT=300 $${PIP_INDEX_URL:+env UV_DEFAULT_INDEX="$$PIP_INDEX_URL"} $(BIN)/uv pip install -q --python $(BIN)/python -r requirements.lock \
+	  || { echo "uv could not install; trying pip, which takes longer"; $(BIN)/python -m pip install -q -r requirements.lock; }
+	@$(BIN)/python -m pip install -q --no-deps --no-build-isolation -e .
+	@touch $(STAMP)
+
+system: ## Install the apt packages for rendering and pictures without a screen (root only).
+	@missing=""; for p in $(APT); do dpkg -s $$p > /dev/null 2>&1 || missing="$$missing $$p"; done; \
+	if [ -z "$$missing" ]; then echo "system packages: all there"; \
+	elif ! command -v apt-get > /dev/null; then echo "no apt-get here: tests that need$$missing will be skipped"; \
+	elif [ "$$(id -u)" != 0 ]; then echo "not root: tests that need a screen-less renderer will be skipped; sudo apt-get install$$missing"; \
+	else apt-get update -qq < /dev/null && DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends $$missing < /dev/null > /dev/null; \
+	  echo "installed:$$missing"; fi
+
+demo: setup ## Deploy the shipped checkpoint into a hidden gap, in simulation (minutes).
+	@$(BIN)/python -m mpc_sgft.deploy --backend sim +experiment=demo
+
+test: setup ## Run the fast tests.
+	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n $(WORKERS) -m "not slow"
+
+test-all: setup ## Run every test, the slow ones too.
+	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n $(WORKERS)
+
+check: setup ## Formatting, linting, types.
+	@$(BIN)/ruff format --check .
+	@$(BIN)/ruff check .
+	@$(BIN)/pyright
+
+format: setup ## Rewrite the files in the house format.
+	@$(BIN)/ruff format .
+	@$(BIN)/ruff check --fix .
+
+clean: ## Remove what builds leave behind; .venv and runs/ stay.
+	@rm -rf build dist *.egg-info .pytest_cache .ruff_cache .hypothesis
+	@find . -name __pycache__ -not -path './.venv/*' -prune -exec rm -rf {} +
