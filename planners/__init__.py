@@ -1,0 +1,1 @@
+"""Choosing by imagining: planners on plain tensors."""

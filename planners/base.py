@@ -1,0 +1,141 @@
+"""What a planner imagines with (`Model`), what it returns (`Plan`), and the objective that all planners share.
+
+Letters: B environments, N candidates, K elites, H horizon, A action, D latent.
+"""
+
+from typing import NamedTuple, Protocol
+
+import torch
+from torch import Tensor
+
+
+class Model(Protocol):
+    """A learned world. Every method takes any leading batch dimensions [...]; a class satisfies it by having them."""
+
+    def next(self, z: Tensor, action: Tensor) -> Tensor:
+        """Latent after `action` [..., A] in latent `z` [..., D]: [..., D]."""
+        ...
+
+    def reward(self, z: Tensor, action: Tensor, next_z: Tensor) -> Tensor:
+        """Reward of the transition, [...]. It may be read from the latent it is received in."""
+        ...
+
+    def terminal_value(self, z: Tensor) -> Tensor:
+        """V(z) of the last imagined latent, reward units, [...]."""
+        ...
+
+    def policy_prior(self, z: Tensor, noise: Tensor | None) -> Tensor:
+        """Action in [-1, 1], [..., A]; `noise` is standard normal of that shape, None gives the mean action."""
+        ...
+
+
+class Plan(NamedTuple):
+    """What a planner decided and remembers; pass it back as `previous` to warm-start the next plan.
+
+    Made under `torch.inference_mode`: clone a field before changing it in place or training through it.
+    """
+
+    action: Tensor  # what to execute now, [-1, 1]                            [B, A]
+    mean: Tensor  # the plan                                                  [B, H, A]
+    std: Tensor  # how sure it is of every entry                              [B, H, A]
+    value: Tensor  # h_step_return of `mean`, reward units                    [B]
+    candidates: Tensor | None = None  # last pool, with keep_candidates       [B, N, H, A]
+    candidate_values: Tensor | None = None  # their h_step_return             [B, N]
+
+
+def h_step_return(model: Model, z: Tensor, actions: Tensor, discount: float) -> Tensor:
+    """Discounted reward over the horizon plus a bootstrapped tail.
+
+        G = Σ_{t<H} γᵗ rₜ + γᴴ V(z_H)
+
+    Args:
+        model: What to imagine with.
+        z: Latent now: one a plan, [..., N, D], or one for all N plans, [..., D].
+        actions: Plans in [-1, 1], [..., N, H, A].
+        discount: γ in [0, 1], per control step.
+
+    Returns:
+        Return of each plan, reward units, [..., N].
+
+    Raises:
+        ValueError: If discount is outside [0, 1], or z and actions do not go together.
+
+    Source: TD-MPC2, arXiv:2310.16828, the planning objective, with V(z) for Q(z, π(z)).
+    """
+    return imagined_return(model, imagine(model, z, actions), actions, discount)
+
+
+def sgft_objective(model: Model, z: Tensor, actions: Tensor, discount: float) -> Tensor:
+    """Discounted sum of the shaped rewards r̄ₜ = rₜ + γ V(zₜ₊₁) - V(zₜ), which telescopes; arguments as `h_step_return`.
+
+        Σ_{t<H} γᵗ r̄ₜ = Σ_{t<H} γᵗ rₜ + γᴴ V(z_H) - V(z₀)
+
+    V(z₀) is the same for all plans of an environment, so planners rank by `h_step_return` alone.
+
+    Source: Yin et al., Rapidly Adapting Policies to the Real World via Simulation-Guided Fine-Tuning, ICLR 2025.
+    """
+    now = model.terminal_value(z)
+    shared = z.dim() == actions.dim() - 2
+    return h_step_return(model, z, actions, discount) - (now.unsqueeze(-1) if shared else now)
+
+
+def imagine(model: Model, z: Tensor, actions: Tensor) -> Tensor:
+    """Latents that plans [..., H, A] visit from `z` (one a plan, or one for all plans), [..., H + 1, D].
+
+    Raises:
+        ValueError: If the leading dimensions of z and actions do not go together.
+    """
+    if z.dim() == actions.dim() - 2 and z.shape[:-1] == actions.shape[:-3]:
+        z = z.unsqueeze(-2).expand(*actions.shape[:-2], -1)
+    if z.shape[:-1] != actions.shape[:-2]:
+        raise ValueError(
+            f"Latents {tuple(z.shape)} do not go with plans {tuple(actions.shape)}: "
+            "allowed are [..., N, D] or [..., D] with [..., N, H, A]."
+        )
+    latents = [z]
+    for action in actions.unbind(-2):
+        latents.append(model.next(latents[-1], action))
+    return torch.stack(latents, -2)
+
+
+def imagine_policy(model: Model, z: Tensor, noise: Tensor | None, horizon: int) -> tuple[Tensor, Tensor]:
+    """Follow the policy prior from `z` [..., D]; noise [..., H, A] or None for its mean action.
+
+    Returns:
+        Latents [..., H + 1, D] and actions [..., H, A].
+    """
+    latents, actions = [z], []
+    for t in range(horizon):
+        actions.append(model.policy_prior(latents[-1], None if noise is None else noise[..., t, :]))
+        latents.append(model.next(latents[-1], actions[-1]))
+    return torch.stack(latents, -2), torch.stack(actions, -2)
+
+
+def imagined_return(model: Model, latents: Tensor, actions: Tensor, discount: float) -> Tensor:
+    """`h_step_return` [...] of plans [..., H, A] whose latents [..., H + 1, D] are already imagined."""
+    check_discount(discount)
+    horizon = actions.shape[-2]
+    rewards = model.reward(latents[..., :-1, :], actions, latents[..., 1:, :])  # [..., H]
+    weights = discount ** torch.arange(horizon + 1, device=rewards.device, dtype=rewards.dtype)
+    return rewards @ weights[:-1] + weights[-1] * model.terminal_value(latents[..., -1, :])
+
+
+def check_discount(discount: float) -> None:
+    """Raise ValueError unless discount is in [0, 1]."""
+    if not 0.0 <= discount <= 1.0:
+        raise ValueError(f"discount={discount} is outside [0, 1].")
+
+
+def check_finite(who: str, what: str, x: Tensor) -> None:
+    """Raise FloatingPointError that names `what` and the environments in which x [B, ...] is not finite."""
+    if not torch.isfinite(x).all():
+        bad = (~torch.isfinite(x).flatten(1).all(1)).nonzero().flatten().tolist()
+        some = ", ".join(map(str, bad[:8])) + (", ..." if len(bad) > 8 else "")
+        raise FloatingPointError(f"{who}: {what} are non-finite (env {some}).")
+
+
+def check_followed(who: str, latents: Tensor, actions: Tensor) -> None:
+    """Raise FloatingPointError that tells a policy prior from a model that left the finite numbers in `imagine_policy`."""
+    check_finite(who, "policy-prior actions", actions[..., :1, :])
+    check_finite(who, "imagined latents", latents)
+    check_finite(who, "policy-prior actions", actions)

@@ -1,0 +1,52 @@
+"""No search: follow the policy prior."""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from planners.base import Model, Plan, check_discount, check_finite, check_followed, imagine_policy, imagined_return
+
+
+@dataclass(frozen=True, kw_only=True)
+class PolicyPlanner:
+    """The policy prior alone, imagined `horizon` steps ahead so that its plan has a value like any other.
+
+    Raises:
+        ValueError: From the constructor, if a number is out of range.
+    """
+
+    action_dim: int
+    horizon: int = 4
+    discount: float = 0.99
+
+    def __post_init__(self) -> None:
+        check_discount(self.discount)
+        for name in ("action_dim", "horizon"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name}={getattr(self, name)}: a planner needs at least 1.")
+
+    @torch.inference_mode()
+    def plan(
+        self,
+        model: Model,
+        z: Tensor,
+        previous: Plan | None,
+        fresh: Tensor | None,
+        generator: torch.Generator,
+        keep_candidates: bool = False,
+        explore: bool = False,
+    ) -> Plan:
+        """Mean actions of the prior from z [B, D], or with `explore` the prior's own samples; remembers nothing.
+
+        Arguments and errors as `SamplingPlanner.plan`; the plan is its own only candidate.
+        """
+        check_finite("PolicyPlanner", "latents", z)
+        shape = (len(z), self.horizon, self.action_dim)
+        noise = torch.randn(shape, generator=generator, device=z.device, dtype=z.dtype) if explore else None
+        latents, mean = imagine_policy(model, z, noise, self.horizon)
+        check_followed("PolicyPlanner", latents, mean)
+        value = imagined_return(model, latents, mean, self.discount)
+        check_finite("PolicyPlanner", "values of the plan", value)
+        kept = (mean.unsqueeze(1), value.unsqueeze(1)) if keep_candidates else (None, None)
+        return Plan(mean[:, 0], mean, torch.zeros_like(mean), value, *kept)

@@ -1,0 +1,149 @@
+"""What MPPI and CEM share: sample plans around a mean, imagine them, move the mean toward the best, a few times over."""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from planners.base import (
+    Model,
+    Plan,
+    check_discount,
+    check_finite,
+    check_followed,
+    h_step_return,
+    imagine_policy,
+    imagined_return,
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SamplingPlanner(ABC):
+    """Iterated sampling over plans [H, A], batched over environments; a concrete planner says how elites are weighted.
+
+    Each iteration draws num_candidates - num_prior plans from N(mean, std), adds the plans of the policy prior (imagined and
+    valued once), keeps the num_elites best and refits
+
+        mean = Σ_k w_k a_k        std = sqrt(Σ_k w_k (a_k - mean)²), clamped to [min_std, max_std]
+
+    The comments of configs/planner/<name>.yaml say what every number does. chunk_rows matters on a CPU only: plans imagined at a
+    time, so that intermediate results stay in cache.
+
+    Raises:
+        ValueError: From the constructor, if a number is out of range.
+    """
+
+    action_dim: int
+    horizon: int = 4
+    num_candidates: int = 512
+    num_prior: int = 24
+    num_elites: int = 64
+    iterations: int = 6
+    min_std: float = 0.05
+    max_std: float = 2.0
+    discount: float = 0.99
+    chunk_rows: int = 1024
+
+    def __post_init__(self) -> None:
+        check_discount(self.discount)
+        for name in ("action_dim", "horizon", "num_candidates", "num_elites", "iterations", "chunk_rows"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name}={getattr(self, name)}: a planner needs at least 1.")
+        if not 0 <= self.num_prior < self.num_candidates:
+            raise ValueError(f"num_prior={self.num_prior} is outside [0, num_candidates={self.num_candidates}).")
+        if self.num_elites > self.num_candidates:
+            raise ValueError(f"num_elites={self.num_elites} exceeds num_candidates={self.num_candidates}.")
+        if not 0 < self.min_std <= self.max_std:
+            raise ValueError(f"0 < min_std <= max_std does not hold: min_std={self.min_std}, max_std={self.max_std}.")
+
+    @abstractmethod
+    def weights(self, values: Tensor) -> Tensor:
+        """Weight of every elite from its value, [B, K]; they sum to one."""
+
+    @torch.inference_mode()
+    def plan(
+        self,
+        model: Model,
+        z: Tensor,
+        previous: Plan | None,
+        fresh: Tensor | None,
+        generator: torch.Generator,
+        keep_candidates: bool = False,
+        explore: bool = False,
+    ) -> Plan:
+        """Plan from the latents z [B, D].
+
+        Args:
+            model: What to imagine with, on the device of z.
+            z: Latent of every environment, [B, D].
+            previous: The last plan, whose mean, shifted by one step, is where the search starts; None starts at zero.
+            fresh: True where an episode just started and `previous` is forgotten, bool [B]; None for nowhere.
+            generator: Source of all randomness, on the device of z.
+            keep_candidates: Also return the last pool of candidates and their values.
+            explore: Execute a sample around the mean instead of the mean.
+
+        Raises:
+            FloatingPointError: If latents, policy prior, candidate values or the plan are not finite; the message says which,
+                and in which environments.
+            ValueError: If `previous` belongs to other sizes.
+        """
+        who, prior = type(self).__name__, self.num_prior
+        check_finite(who, "latents", z)
+        mean = self._warm_start(z, previous, fresh)  # [B, H, A]
+        std = torch.full_like(mean, self.max_std)
+        pool = z.new_empty(len(z), self.num_candidates, self.horizon, self.action_dim)
+        values = z.new_empty(len(z), self.num_candidates)
+        if prior:
+            noise = torch.randn(pool[:, :prior].shape, generator=generator, device=z.device, dtype=z.dtype)
+            start = z.unsqueeze(1).expand(-1, prior, -1)
+            latents, pool[:, :prior] = imagine_policy(model, start, noise, self.horizon)
+            check_followed(who, latents, pool[:, :prior])
+            values[:, :prior] = imagined_return(model, latents, pool[:, :prior], self.discount)
+
+        starts = z.repeat_interleave(self.num_candidates - prior, 0)  # [B (N - P), D]
+        noise = torch.empty_like(pool[:, prior:])
+        for _ in range(self.iterations):
+            noise.normal_(generator=generator)
+            pool[:, prior:] = torch.addcmul(mean.unsqueeze(1), std.unsqueeze(1), noise).clamp_(-1, 1)
+            values[:, prior:] = self._evaluate(model, starts, pool[:, prior:])
+            check_finite(who, "candidate values", values)
+            mean, std = self.refit(pool, values)
+        check_finite(who, "planned actions", mean)
+        value = h_step_return(model, z, mean.unsqueeze(1), self.discount).squeeze(1)
+        check_finite(who, "values of the plan", value)
+        action = mean[:, 0]
+        if explore:
+            draw = torch.randn(action.shape, generator=generator, device=z.device, dtype=z.dtype)
+            action = (action + std[:, 0] * draw).clamp(-1, 1)
+        kept = (pool, values) if keep_candidates else (None, None)
+        return Plan(action, mean, std, value, *kept)
+
+    def refit(self, pool: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean and clamped std of the elites, each [B, H, A], from candidates [B, N, H, A] and their values [B, N]."""
+        top, index = values.topk(self.num_elites, dim=1)
+        elites = pool.gather(1, index[..., None, None].expand(-1, -1, *pool.shape[2:]))  # [B, K, H, A]
+        weight = self.weights(top)[..., None, None]
+        mean = (weight * elites).sum(1).clamp(-1, 1)  # rounding may leave [-1, 1]
+        variance = (weight * (elites - mean.unsqueeze(1)).square()).sum(1)
+        return mean, variance.sqrt().clamp(self.min_std, self.max_std)
+
+    def _evaluate(self, model: Model, starts: Tensor, actions: Tensor) -> Tensor:
+        """Return of the plans [B, n, H, A] from latents [B n, D], [B, n]."""
+        rows = len(starts) if starts.is_cuda else self.chunk_rows
+        chunks = zip(starts.split(rows), actions.flatten(0, 1).split(rows), strict=True)
+        values = torch.cat([h_step_return(model, z, plans, self.discount) for z, plans in chunks])
+        return values.view(actions.shape[:2])
+
+    def _warm_start(self, z: Tensor, previous: Plan | None, fresh: Tensor | None) -> Tensor:
+        """The previous mean one step on, zero where an episode just started, [B, H, A]."""
+        mean = z.new_zeros(len(z), self.horizon, self.action_dim)
+        if previous is None:
+            return mean
+        if previous.mean.shape != mean.shape:
+            raise ValueError(
+                f"The previous plan is {tuple(previous.mean.shape)}, this one {tuple(mean.shape)} (environments, horizon, "
+                "action entries): start with previous=None where one of them changes."
+            )
+        mean[:, :-1] = previous.mean[:, 1:]
+        return mean if fresh is None else mean.masked_fill_(fresh.view(-1, 1, 1), 0)

@@ -1,0 +1,33 @@
+"""Freed memory stays in the process, where the C library can be told so."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+FAULTS = """
+import resource, torch
+from planners.memory import keep_freed_memory
+torch.set_num_threads(1)
+
+def faults():
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    for _ in range(50):
+        x = [torch.zeros(2_000_000) for _ in range(2)]  # 8 MB each
+        del x
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+
+default = faults()
+assert keep_freed_memory()
+faults()
+print(default, faults())
+"""
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="glibc only")
+def test_memory_is_not_fetched_again() -> None:
+    root = Path(__file__).resolve().parents[2]
+    run = subprocess.run([sys.executable, "-c", FAULTS], cwd=root, capture_output=True, text=True, timeout=120, check=True)
+    default, kept = map(int, run.stdout.split())
+    assert kept < 1000 < default
