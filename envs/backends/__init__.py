@@ -1,0 +1,1 @@
+"""Where an action goes: the simulator, or a robot."""

@@ -1,0 +1,45 @@
+"""The line between what is above (learning) and what is below (physics, or a robot)."""
+
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from envs.task import AbstractTask, Array
+
+
+class Outcome(NamedTuple):
+    """What one control period brought, a row each environment."""
+
+    observation: Array  # [N, O] as sensed
+    reward: Array  # [N]
+    success: NDArray[np.bool_]  # [N] the goal holds now
+    terminated: NDArray[np.bool_]  # [N] the task ended
+    action_sent: Array  # [N, A] the action after the interface's own limits
+    invalid: NDArray[np.bool_]  # [N] the period must not be learned from
+
+
+class Backend(Protocol):
+    """Resets, and carries out actions. Everything above sees observations and rewards, nothing else."""
+
+    task: AbstractTask
+    num_envs: int
+
+    def seed(self, seed: int) -> None:
+        """Make everything random from here on a function of `seed`."""
+
+    def reset(self, sims: NDArray[np.int_]) -> Array:
+        """Start new episodes in some environments; their first observations, [n, O]."""
+
+    def send(self, action: Array) -> Outcome:
+        """Carry out one control period in every environment."""
+
+    def positions(self) -> Array | None:
+        """Joint positions of the first environment now, [nq]; None if there are none to show."""
+
+    def samples(self) -> dict[str, Array] | None:
+        """Joint-level record of the first environment's last period at 100 Hz or more: time [S] since the episode's
+        start, qpos [S, nq], qvel [S, nv], ctrl [S, nu], force [S, nu]; None if there is none."""
+
+    def describe(self) -> dict[str, object]:
+        """Names of joints and actuators, for recordings; nothing of what is hidden."""

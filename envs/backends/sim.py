@@ -1,0 +1,210 @@
+"""MuJoCo as the world: N copies on threads, each its own model, with the effects of a gap."""
+
+import logging
+import os
+from collections import Counter
+
+import mujoco
+import numpy as np
+from mujoco.batch import Batch
+from numpy.typing import NDArray
+
+from envs.backends.base import Outcome
+from envs.effects.base import Effect
+from envs.randomize import Draw, Randomizer
+from envs.task import AbstractTask, Array, whole_steps
+
+log = logging.getLogger(__name__)
+MAX_SAMPLE_DT = 0.01  # [s] recorded at least this often
+MAX_PAST = 2.0  # [s] of true states kept for delayed sensors; the bound of sensor_delay
+CTRL = int(mujoco.mjtState.mjSTATE_CTRL)
+
+
+class SimBackend:
+    """N simulations of a task.
+
+    Within a control period the actuator signal moves linearly to its new value. A simulation that MuJoCo stops with a
+    warning, or whose state is not finite, is unstable: its periods are marked invalid until it is reset, and it is
+    counted in `counters` and logged once.
+
+    Args:
+        task: What is simulated.
+        num_envs: N.
+        effects: What this reality has and the nominal simulator lacks.
+        draws: Domain randomisation, drawn anew for each episode.
+        noise_sd: Standard deviation of the observation noise [m or rad] of noisy episodes.
+        noise_probability: Share of episodes that are noisy.
+        threads: Simulation threads; 0 takes all cores that this process may use. They do not change the results.
+
+    Raises:
+        ValueError: For an effect or a draw that does not fit the task.
+    """
+
+    def __init__(
+        self,
+        task: AbstractTask,
+        num_envs: int,
+        *,
+        effects: list[Effect] | None = None,
+        draws: list[Draw] | None = None,
+        noise_sd: float = 0.0,
+        noise_probability: float = 0.0,
+        threads: int = 0,
+    ):
+        self.task, self.num_envs, self.effects = task, num_envs, effects or []
+        spec = task.spec()
+        for effect in self.effects:
+            effect.edit_spec(spec)
+        self.model = spec.compile()
+        self.batch = Batch(self.model, num_envs, min(threads or _cores(), num_envs))
+        self.qpos, self.qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
+        self.signal, self.act = self.batch.bind("ctrl"), self.batch.bind("act")
+        self.clock, self.delayed = self.batch.bind("time"), self.batch.bind("history")
+        self.applied = self.batch.bind("qfrc_applied")
+        self.randomizer = Randomizer(self.batch, self.model, draws or [])
+        self.noise_sd, self.noise_probability = noise_sd, noise_probability
+        self.steps = whole_steps(task.control_dt, task.sim_dt)
+        self.has_force = any(type(e).force is not Effect.force for e in self.effects)
+        self.counters: Counter[str] = Counter()
+        self.slots = [_history_values(self.model, i) for i in range(self.model.nu)]
+        self.record = ("qpos", "qvel", "actuator_force")
+        self.target = np.zeros((num_envs, task.start(np.random.default_rng(0)).target.shape[1]))
+        self.noisy, self.unstable = np.zeros(num_envs, bool), np.zeros(num_envs, bool)
+        self.remembers = any(type(e).sense is not Effect.sense for e in self.effects)
+        self.past: list[tuple[Array, Array]] = []
+        self._last: dict[str, Array] = {}
+        self.seed(0)
+        for effect in self.effects:  # a parameter that does not fit the task stops here, not in the first episode
+            effect.command(np.zeros((1, task.action_dim)), task)
+            nothing = np.zeros((1, len(task.observation_names)))
+            effect.sense(nothing, lambda _, same=nothing: same, lambda k: np.zeros((1, k)), task)
+
+    def seed(self, seed: int) -> None:
+        """One generator each environment, so that an episode does not depend on its neighbours."""
+        self.rngs = [np.random.default_rng((seed, i)) for i in range(self.num_envs)]
+        self.sensor_rngs = [np.random.default_rng((seed, i, 1)) for i in range(self.num_envs)]
+
+    def reset(self, sims: NDArray[np.int_]) -> Array:
+        rngs = [self.rngs[i] for i in sims]
+        self.batch.reset(np.asarray(sims, np.int32), stage=mujoco.mjtStage.mjSTAGE_NONE)
+        self.randomizer.draw([int(i) for i in sims], rngs)
+        for i, rng in zip(sims, rngs, strict=True):
+            start = self.task.start(rng)
+            self.qpos[i], self.qvel[i], self.target[i] = start.qpos[0], start.qvel[0], start.target[0]
+            self.noisy[i] = rng.uniform() < self.noise_probability
+        ctrl = self.task.ctrl(self.target[sims], self.qpos[sims, : self.model.nu])
+        self.signal[sims], self.unstable[sims] = ctrl, False
+        if self.model.na:
+            self.act[sims] = ctrl
+        for actuator, slots in enumerate(self.slots):
+            if slots is not None:
+                self.delayed[np.ix_(sims, slots)] = ctrl[:, actuator, None]
+        if self.remembers:
+            still = [np.repeat(x[:, None], self.steps, 1) for x in (self.qpos, self.qvel)]
+            for qpos, qvel in self.past:
+                qpos[sims], qvel[sims] = still[0][sims], still[1][sims]
+            self.past = self.past or [(still[0], still[1])]
+        return self._sense(self.task.observe(self.qpos[sims], self.qvel[sims]), sims)
+
+    def send(self, action: Array) -> Outcome:
+        sent = np.clip(action, -1.0, 1.0)
+        realised = sent
+        for effect in self.effects:
+            realised = effect.command(realised, self.task)
+        self.target = self.task.move(self.target, realised)
+        before = self.signal.copy()
+        ramp = np.linspace(0, 1, self.steps + 1)[1:, None]
+        ctrl = before[:, None] + ramp * (self.task.ctrl(self.target, before) - before)[:, None]  # [N, S, nu]
+        start = float(self.clock[0])
+        moved = self._advance(ctrl)
+        self._last = {"time": start + self.task.sim_dt * np.arange(1, self.steps + 1), "ctrl": ctrl, **moved}
+        if self.remembers:
+            self.past.insert(0, (moved["qpos"].copy(), moved["qvel"].copy()))
+            del self.past[int(MAX_PAST / self.task.control_dt) + 1 :]
+        truth = self.task.observe(self.qpos, self.qvel)
+        return Outcome(
+            observation=self._sense(truth, np.arange(self.num_envs)),
+            reward=self.task.reward(truth, sent),
+            success=self.task.success(truth),
+            terminated=self.task.terminated(truth),
+            action_sent=sent,
+            invalid=self._check_physics(),
+        )
+
+    def positions(self) -> Array:
+        return self.qpos[0].copy()
+
+    def samples(self) -> dict[str, Array]:
+        """As `Backend.samples`, thinned to 125 Hz at 4 ms."""
+        every = max(1, int(MAX_SAMPLE_DT / self.task.sim_dt))
+        pick = slice(every - 1, None, every)
+        last = self._last
+        return {"time": last["time"][pick]} | {k: last[k][0, pick] for k in ("qpos", "qvel", "ctrl", "force")}
+
+    def describe(self) -> dict[str, object]:
+        model = self.model
+        return {
+            "joint_names": [model.joint(i).name for i in range(model.njnt)],
+            "actuator_names": [model.actuator(i).name for i in range(model.nu)],
+        }
+
+    def _advance(self, ctrl: Array) -> dict[str, Array]:
+        """Simulate one period; a force that depends on the state is renewed at each physics step."""
+        if not self.has_force:
+            out = self.batch.rollout(self.steps, control=ctrl, control_spec=CTRL, record=self.record)
+        else:
+            parts = []
+            for k in range(self.steps):
+                forces = (e.force(self.qpos, self.qvel) for e in self.effects)
+                self.applied[:] = sum(f for f in forces if f is not None)
+                parts.append(self.batch.rollout(1, control=ctrl[:, k : k + 1], control_spec=CTRL, record=self.record))
+            out = {name: np.concatenate([p[name] for p in parts], 1) for name in self.record}
+        return {"qpos": out["qpos"], "qvel": out["qvel"], "force": out["actuator_force"]}
+
+    def _sense(self, truth: Array, sims: NDArray[np.int_]) -> Array:
+        """What the sensors of some environments read, [n, O]; each has its own noise."""
+
+        def noise(k: int) -> Array:
+            return np.stack([self.sensor_rngs[i].standard_normal(k) for i in sims])
+
+        read = truth
+        for effect in self.effects:
+            read = effect.sense(read, lambda delay: self._past(delay, sims), noise, self.task)
+        if self.noise_sd:
+            read = read + self.noise_sd * self.noisy[sims, None] * noise(read.shape[1])
+        return read
+
+    def _past(self, delay: float, sims: NDArray[np.int_]) -> Array:
+        """The true observation `delay` seconds ago, [n, O]; before the start, the first one."""
+        period, back = divmod(round(delay / self.task.sim_dt), self.steps)
+        qpos, qvel = self.past[min(period, len(self.past) - 1)]
+        return self.task.observe(qpos[sims, self.steps - 1 - back], qvel[sims, self.steps - 1 - back])
+
+    def _check_physics(self) -> NDArray[np.bool_]:
+        """Which simulations are unstable, [N]; those that became so are counted and logged with MuJoCo's reason."""
+        raised = self.batch.warning[:, :, 1] > 0  # [N, kinds of warning]
+        finite = np.isfinite(self.qpos).all(1) & np.isfinite(self.qvel).all(1)
+        unstable = raised.any(1) | ~finite
+        for i in np.flatnonzero(unstable & ~self.unstable):
+            kinds = [mujoco.mjtWarning(int(k)).name.removeprefix("mjWARN_") for k in np.flatnonzero(raised[i])]
+            reason = ", ".join(kinds) or "the state is not finite"
+            self.counters["unstable"] += 1
+            log.warning("environment %d: physics unstable (%s); the episode ends and the step is dropped", i, reason)
+        self.unstable = unstable
+        return unstable.copy()
+
+
+def _cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _history_values(model: mujoco.MjModel, actuator: int) -> NDArray[np.int_] | None:
+    """Where mjData.history keeps the past signals of an actuator, found by writing two values; None without any."""
+    if not model.actuator_history[actuator, 0]:
+        return None
+    data, count = mujoco.MjData(model), int(model.actuator_history[actuator, 0])
+    written = []
+    for value in (1.0, 2.0):
+        mujoco.mj_initCtrlHistory(model, data, actuator, None, np.full(count, value))
+        written.append(data.history.copy())
+    return np.flatnonzero(written[0] != written[1])

@@ -1,0 +1,5 @@
+"""What reality has and the nominal simulator lacks: one file each effect."""
+
+from envs.effects.base import Effect, available, load
+
+__all__ = ["Effect", "available", "load"]

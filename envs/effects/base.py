@@ -1,0 +1,127 @@
+"""What every effect can change: the scene, the command, a force, what a sensor reads.
+
+An effect is physics that reality has and the nominal simulator lacks: one file each, a frozen dataclass whose fields
+are its parameters. `load` builds a list of them from a mapping, as in configs/gap/*.yaml.
+"""
+
+import importlib
+import pkgutil
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields
+from difflib import get_close_matches
+from typing import Any, ClassVar
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from envs.task import AbstractTask
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Effect:
+    """Base of all effects: four hooks that do nothing.
+
+    Attributes:
+        units: Unit of each numeric parameter.
+        bounds: Physically sensible range of each numeric parameter; values outside are refused.
+    """
+
+    units: ClassVar[dict[str, str]] = {}
+    bounds: ClassVar[dict[str, tuple[float, float]]] = {}
+
+    def __post_init__(self) -> None:
+        for name, (low, high) in self.bounds.items():
+            for value in np.atleast_1d(getattr(self, name)):
+                if not low <= value <= high:
+                    unit = self.units.get(name, "")
+                    raise ValueError(f"{type(self).__name__}.{name}={value} {unit}: allowed are {low} to {high} {unit}")
+
+    def edit_spec(self, spec: mujoco.MjSpec) -> None:
+        """Change the scene before it is compiled."""
+
+    def command(self, action: Array, task: AbstractTask) -> Array:
+        """Change the action [N, A] between the interface and the machine."""
+        return action
+
+    def force(self, qpos: Array, qvel: Array) -> Array | None:
+        """Generalised force [N, nv] to add, N or N m; None if there is none."""
+        return None
+
+    def sense(
+        self, observation: Array, past: Callable[[float], Array], noise: Callable[[int], Array], task: AbstractTask
+    ) -> Array:
+        """Change what is observed, [n, O].
+
+        Args:
+            observation: As read so far, [n, O].
+            past: past(s) is the true observation s seconds ago, [n, O].
+            noise: noise(k) draws standard normal numbers, [n, k], each row with its environment's own generator.
+            task: What is observed.
+        """
+        return observation
+
+
+def available() -> list[str]:
+    """Names of the effects, which are the names of the files in this folder."""
+    import envs.effects as package
+
+    return sorted(m.name for m in pkgutil.iter_modules(package.__path__) if m.name not in ("base",))
+
+
+def load(effects: Mapping[str, Mapping[str, Any] | None]) -> list[Effect]:
+    """Build effects from {name: {parameter: value}}.
+
+    Raises:
+        ValueError: For an unknown effect or parameter, or a value out of bounds; the message lists what is allowed.
+    """
+    built = []
+    for name, parameters in effects.items():
+        if name not in available():
+            near = get_close_matches(name, available(), 1)
+            hint = f" Did you mean {near[0]}?" if near else ""
+            raise ValueError(f"No effect {name!r} in envs/effects/. Available: {', '.join(available())}.{hint}")
+        kind = importlib.import_module(f"envs.effects.{name}").EFFECT
+        allowed = [f.name for f in fields(kind)]
+        unknown = sorted(set(parameters or {}) - set(allowed))
+        if unknown:
+            raise ValueError(f"Effect {name} has no parameter {unknown[0]!r}. It has: {', '.join(allowed)}.")
+        try:
+            built.append(kind(**{k: _as_field(kind, k, v) for k, v in (parameters or {}).items()}))
+        except TypeError as error:
+            raise ValueError(f"Effect {name}: {error}. Its parameters: {', '.join(allowed)}.") from error
+    return built
+
+
+def _as_field(kind: type[Effect], name: str, value: Any) -> Any:
+    """A parameter from yaml as the dataclass holds it: lists become tuples, a single name a tuple of one."""
+    if isinstance(value, str) and isinstance(getattr(kind, name), tuple):
+        return (value,)
+    return tuple(value) if isinstance(value, list) else value
+
+
+def per_axis(value: float | tuple[float, ...], size: int, what: str) -> Array:
+    """One number for all axes, or one each, [1] or [size].
+
+    Raises:
+        ValueError: If there are neither one nor `size` numbers.
+    """
+    values = np.atleast_1d(np.asarray(value, float))
+    if len(values) not in (1, size):
+        raise ValueError(f"{what}={value}: {len(values)} numbers; give one, or {size}")
+    return values
+
+
+def pick(elements: list[Any], at: tuple[str, ...], kind: str) -> list[Any]:
+    """The scene's elements with the names in `at`, or all of them if `at` is empty.
+
+    Raises:
+        ValueError: For a name that the scene lacks.
+    """
+    names = [e.name for e in elements]
+    for name in at:
+        if name not in names:
+            raise ValueError(f"No {kind} {name!r} in this scene. Available: {', '.join(n for n in names if n)}.")
+    return [e for e in elements if not at or e.name in at]

@@ -1,0 +1,26 @@
+"""Things slide more or less easily than the model says."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import mujoco
+
+from envs.effects.base import Effect, pick
+
+
+@dataclass(frozen=True)
+class ContactFriction(Effect):
+    """Set the sliding friction of geoms, and let it decide in each of their contacts (`priority`)."""
+
+    coefficient: float = 1.0
+    at: tuple[str, ...] = ("puck",)  # geoms
+    units: ClassVar[dict[str, str]] = {"coefficient": "1"}
+    bounds: ClassVar[dict[str, tuple[float, float]]] = {"coefficient": (0.0, 10.0)}
+
+    def edit_spec(self, spec: mujoco.MjSpec) -> None:
+        for geom in pick(spec.geoms, self.at, "geom"):
+            geom.friction[0] = self.coefficient
+            geom.priority = max(geom.priority, 1)
+
+
+EFFECT = ContactFriction

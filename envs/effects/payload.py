@@ -1,0 +1,34 @@
+"""A body is heavier than the model says."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import mujoco
+
+from envs.effects.base import Effect, pick
+
+
+@dataclass(frozen=True)
+class Payload(Effect):
+    """Fix a point mass to a body. It is a body of its own: the arm's gravity compensation does not know of it."""
+
+    mass: float = 0.0
+    at: tuple[str, ...] = ("link7",)  # bodies
+    position: tuple[float, float, float] = (0.0, 0.0, 0.0)  # in the body's frame
+    units: ClassVar[dict[str, str]] = {"mass": "kg", "position": "m"}
+    bounds: ClassVar[dict[str, tuple[float, float]]] = {"mass": (0.0, 100.0)}
+
+    def edit_spec(self, spec: mujoco.MjSpec) -> None:
+        for body in pick(spec.bodies, self.at, "body"):
+            load = body.add_body(name=f"payload_{body.name}", pos=list(self.position))
+            load.add_geom(
+                type=mujoco.mjtGeom.mjGEOM_SPHERE,
+                size=[0.01, 0, 0],
+                mass=self.mass,
+                contype=0,
+                conaffinity=0,
+                rgba=[0, 0, 0, 0],
+            )
+
+
+EFFECT = Payload

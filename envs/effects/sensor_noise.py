@@ -1,0 +1,40 @@
+"""A sensor is noisy."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import ClassVar
+
+from envs.effects.base import Array, Effect
+from envs.task import AbstractTask
+
+
+def columns(task: AbstractTask, at: tuple[str, ...]) -> list[int]:
+    """Indices of named observations, all of them if `at` is empty.
+
+    Raises:
+        ValueError: For a name that the task does not observe.
+    """
+    for name in at:
+        if name not in task.observation_names:
+            raise ValueError(f"{task.name} observes no {name!r}. It observes: {', '.join(task.observation_names)}.")
+    return [i for i, name in enumerate(task.observation_names) if not at or name in at]
+
+
+@dataclass(frozen=True)
+class SensorNoise(Effect):
+    """Add white Gaussian noise to what is observed."""
+
+    sd: float = 0.0
+    at: tuple[str, ...] = ()  # observation names; all if empty
+    units: ClassVar[dict[str, str]] = {"sd": "of the observation"}
+    bounds: ClassVar[dict[str, tuple[float, float]]] = {"sd": (0.0, 10.0)}
+
+    def sense(
+        self, observation: Array, past: Callable[[float], Array], noise: Callable[[int], Array], task: AbstractTask
+    ) -> Array:
+        read, at = observation.copy(), columns(task, self.at)
+        read[:, at] += self.sd * noise(len(at))
+        return read
+
+
+EFFECT = SensorNoise

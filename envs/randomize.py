@@ -1,0 +1,135 @@
+"""Domain randomisation: each episode draws its own model, field by field."""
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any
+
+import mujoco
+import numpy as np
+from mujoco.batch import Batch
+from numpy.typing import NDArray
+
+OPERATIONS = {"add": np.add, "scale": np.multiply, "set": lambda nominal, drawn: np.full_like(nominal, drawn)}
+
+
+@dataclass(frozen=True)
+class Draw:
+    """One random number per episode, written into fields of the model.
+
+    Attributes:
+        fields: MjModel fields, with an optional last index: `geom_friction[0]`.
+        at: Names of the rows to write (bodies, geoms, joints or actuators, by the field's prefix); all if empty.
+        operation: `add` to, `scale`, or `set` the nominal value.
+        low, high: Range of the draw, in the field's unit.
+        distribution: `uniform` or `loguniform`.
+    """
+
+    fields: tuple[str, ...]
+    low: float
+    high: float
+    at: tuple[str, ...] = ()
+    operation: str = "scale"
+    distribution: str = "uniform"
+
+    def __post_init__(self) -> None:
+        if self.operation not in OPERATIONS:
+            raise ValueError(f"operation={self.operation!r}; allowed: {', '.join(OPERATIONS)}")
+        if self.distribution not in ("uniform", "loguniform"):
+            raise ValueError(f"distribution={self.distribution!r}; allowed: uniform, loguniform")
+        if self.low > self.high or (self.distribution == "loguniform" and self.low <= 0):
+            raise ValueError(f"range {self.low} to {self.high} is empty or not positive ({self.distribution})")
+
+    def sample(self, rng: np.random.Generator) -> float:
+        if self.distribution == "loguniform":
+            return float(np.exp(rng.uniform(np.log(self.low), np.log(self.high))))
+        return float(rng.uniform(self.low, self.high))
+
+
+def load(draws: Mapping[str, Mapping[str, Any]]) -> list[Draw]:
+    """Build draws from configs/randomize/*.yaml, {name: {fields, at, operation, low, high, distribution}}.
+
+    Raises:
+        ValueError: For an unknown or missing key, or a value that is not allowed.
+    """
+    built = []
+    for name, entries in draws.items():
+        try:
+            built.append(Draw(**{k: tuple(v) if isinstance(v, list) else v for k, v in entries.items()}))
+        except TypeError as error:
+            raise ValueError(
+                f"randomize draw {name!r}: {error}. It has: {', '.join(f.name for f in fields(Draw))}."
+            ) from error
+    return built
+
+
+class Randomizer:
+    """Writes the draws into the per-simulation fields of a batch.
+
+    Raises:
+        ValueError: For a field or a name that the model lacks, or a delay that its command history cannot hold.
+    """
+
+    def __init__(self, batch: Batch, model: mujoco.MjModel, draws: list[Draw]):
+        self.batch, self.draws = batch, draws
+        self.targets = [[_locate(model, field, d.at) for field in d.fields] for d in draws]
+        names = {name for targets in self.targets for name, _, _ in targets}
+        self.arrays = {name: batch.expand(name) for name in names}
+        self.nominal = {name: np.array(getattr(model, name)) for name in names}
+        inputs = mujoco.MjModel._setconst_inputs
+        self.needs_constants = any(name in inputs for name in names)
+        self._check_delays(model)
+
+    def draw(self, sims: list[int], rngs: list[np.random.Generator]) -> None:
+        """Give each simulation in `sims` a model of its own, drawn with its own generator."""
+        for sim, rng in zip(sims, rngs, strict=True):
+            self._write({name: array[sim] for name, array in self.arrays.items()}, [d.sample(rng) for d in self.draws])
+        if self.needs_constants and sims:
+            self.batch.set_const(np.array(sims, np.int32))
+
+    def _write(self, model: dict[str, NDArray], values: list[float]) -> None:
+        """Write the nominal model with `values`, one each draw, into one simulation's fields."""
+        for name, field in model.items():
+            field[...] = self.nominal[name]
+        for draw, targets, value in zip(self.draws, self.targets, values, strict=True):
+            for name, rows, column in targets:
+                where = (rows, column) if column is not None else rows
+                model[name][where] = OPERATIONS[draw.operation](model[name][where], value)
+
+    def _check_delays(self, model: mujoco.MjModel) -> None:
+        """MuJoCo silently clips a delay that is longer than the command history."""
+        if "actuator_delay" not in self.nominal:
+            return
+        held = model.actuator_history[:, 0] * model.opt.timestep
+        for values in ([d.low for d in self.draws], [d.high for d in self.draws]):
+            drawn = {name: array.copy() for name, array in self.nominal.items()}
+            self._write(drawn, values)
+            delay = drawn["actuator_delay"]
+            if (delay < 0).any() or (delay > held).any():
+                raise ValueError(
+                    f"randomised actuator_delay of {delay.min():.3g} to {delay.max():.3g} s: the model's history holds "
+                    f"0 to {held.min():.3g} s; change the range or raise the actuators' nsample"
+                )
+
+
+def _locate(model: mujoco.MjModel, field: str, at: tuple[str, ...]) -> tuple[str, list[int], int | None]:
+    """(field name, row indices, column) of 'geom_friction[0]' at the named rows."""
+    match = re.fullmatch(r"(\w+?)(?:\[(\d+)\])?", field)
+    name = match[1] if match else field
+    if not match or not hasattr(model, name):
+        raise ValueError(f"MjModel has no field {field!r} to randomise")
+    kinds = {"body": "body", "geom": "geom", "dof": "joint", "jnt": "joint", "actuator": "actuator"}
+    prefix = name.split("_")[0]
+    if prefix not in kinds:
+        raise ValueError(f"field {field!r}: only fields of {', '.join(kinds)} can be randomised")
+    array, column = getattr(model, name), int(match[2]) if match[2] else None
+    if column is not None and (array.ndim < 2 or column >= array.shape[1]):
+        raise ValueError(f"field {field!r}: {name} has the shape {array.shape}")
+    access = getattr(model, kinds[prefix])
+    try:
+        ids = [access(n).id for n in at]
+    except KeyError as error:
+        raise ValueError(f"randomise {field}: {error.args[0]}") from error
+    if prefix == "dof":
+        ids = [int(dof) for i in ids for dof in np.flatnonzero(model.dof_jntid == i)]
+    return name, ids or list(range(len(array))), column

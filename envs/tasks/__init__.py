@@ -1,0 +1,1 @@
+"""One file each task; configs/task/<name>.yaml names the class."""
