@@ -1,0 +1,206 @@
+"""The deployment loop: drive a real rollout, record it, learn from it, measure, show, save. Nothing real is lost."""
+
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import torch
+from omegaconf import DictConfig
+
+from envs.env import ControlEnv
+from mpc_sgft import build, checkpoint, run_folder
+from mpc_sgft.agent import Agent
+from mpc_sgft.audit import audit, write_audit
+from mpc_sgft.drive import Rollout, drive, from_episode
+from mpc_sgft.errors import Stopped, UserError
+from mpc_sgft.log import GrowingTable, MetricLogger, progress
+from mpc_sgft.pretrain_loop import EVAL_SEED, StopRequest
+from mpc_sgft.record import read_episode
+from mpc_sgft.rollout import Score, collect, planner_policy, score
+from mpc_sgft.show import DeployViewer
+from mpc_sgft.transfer import Transfer, open_loop_error
+from planners.policy import PolicyPlanner
+
+REAL_SEED = 2_000_000  # real rollouts never share a seed with evaluation or pretraining
+
+
+def deploy(cfg: DictConfig) -> int:
+    """Adapt a pretrained agent with real rollouts; returns the exit code."""
+    if cfg.backend.name == "franka":
+        raise UserError("--backend franka is not in this version. Rehearse with --backend sim and a gap, e.g. gap=turned.")
+    agent, _ = build.load_agent(cfg)
+    env = build.make_env(cfg, 1)
+    judge = build.make_env(cfg, cfg.eval_episodes)
+    build.check_fits(agent.model, env)
+    run = Deployment(cfg, agent, env, judge)
+    return run.loop()
+
+
+class Deployment:
+    """State of one deployment and its folder."""
+
+    def __init__(self, cfg: DictConfig, agent: Agent, env: ControlEnv, judge: ControlEnv):
+        self.cfg, self.env, self.judge = cfg, env, judge
+        self.folder = run_folder.start(cfg)
+        (self.folder / "episodes").mkdir(exist_ok=True)
+        torch.set_num_threads(cfg.torch_threads)
+        self.planner = build.make_planner(cfg, env.action_dim)
+        t = cfg.transfer
+        agent.freeze_for_transfer(cfg.method, horizon=cfg.planner.horizon, anchor=t.anchor, residual=t.residual)
+        self.frozen = agent.frozen_hash()
+        self.transfer = Transfer(
+            agent,
+            capacity=(cfg.rollouts + 1) * env.task.episode_steps,
+            slice_len=cfg.train.replay.slice_len,
+            batch_size=cfg.train.replay.batch_size,
+            seed=cfg.seed,
+            updates=t.updates if cfg.method != "zero_shot" else 0,
+            gate=t.gate and cfg.method == "sgft",
+            margin=t.gate_margin,
+            memory=t.gate_memory,
+        )
+        self.state: dict[str, Any] = {"rollouts": 0, "aborted": 0, "scores": {}, "seconds": 0.0, "successes": 0}
+        if cfg.resume is not None:
+            self._resume()
+        self.logger = MetricLogger(
+            self.folder,
+            csv=cfg.log.csv,
+            tensorboard=cfg.log.tensorboard,
+            wandb=cfg.log.wandb,
+            resume_step=self.state["rollouts"] if cfg.resume is not None else None,
+        )
+        self.viewer = DeployViewer(self.folder / "run.rrd", env, resume=cfg.resume is not None) if cfg.log.rerun else None
+        self.began = time.monotonic() - self.state["seconds"]
+
+    def loop(self) -> int:
+        """Run what is left, and write the summary."""
+        cfg, stop, table = self.cfg, StopRequest("rollout"), None if self.cfg.quiet else GrowingTable()
+        if not self.state["scores"]:
+            self._evaluate(table, {})
+            self._save()
+        if self.viewer:
+            self.viewer.value_map("before", self.transfer.acting)
+        bar = progress(cfg.rollouts, initial=self.state["rollouts"], desc=f"deploy {cfg.method}", unit="rollout", disable=cfg.quiet)
+        while self.state["rollouts"] < cfg.rollouts:
+            number = self.state["rollouts"] + 1
+            rollout = self._rollout(number)
+            metrics = self._measure(rollout, number)
+            metrics |= self.transfer.learn(rollout.steps[~rollout.steps["next", "invalid"][:, 0]])
+            self.state["rollouts"] = number
+            self.state["aborted"] += rollout.aborted is not None
+            self.state["successes"] += rollout.success
+            if number % cfg.eval_every == 0 or number == cfg.rollouts:
+                self._evaluate(table, metrics)
+            self.logger.log(number, metrics)
+            self._save()
+            bar.update(1)
+            bar.set_postfix(real_success=f"{self.state['successes']}/{number}")
+            if stop.asked:
+                raise Stopped(f"saved after {number} rollouts. Go on: python -m mpc_sgft.deploy --resume {self.folder}")
+        bar.close()
+        return self._finish()
+
+    def _rollout(self, number: int) -> Rollout:
+        """The next real rollout; one that a killed process recorded is used as it is, not driven again."""
+        cfg, path = self.cfg, self.folder / "episodes" / f"{number:04d}.mcap"
+        if path.exists():
+            episode = read_episode(path)
+            if episode.transitions:
+                return from_episode(episode, number)
+            path.rename(path.with_suffix(".empty.mcap"))  # the robot never moved
+        planner = self.planner
+        if number <= cfg.warmup:
+            planner = PolicyPlanner(action_dim=self.env.action_dim, horizon=cfg.planner.horizon, discount=cfg.task.discount)
+        model = self.transfer.pretrained if number <= cfg.warmup else self.transfer.acting
+        return drive(
+            self.env,
+            model,
+            planner,
+            path,
+            number=number,
+            seed=REAL_SEED + 1000 * cfg.seed + number,
+            noise=cfg.transfer.action_noise,
+            candidate_steps=tuple(cfg.candidate_steps),
+        )
+
+    def _measure(self, rollout: Rollout, number: int) -> dict[str, float]:
+        """Model error and improvability of a rollout under the model that drove it, and its view in rerun."""
+        model, horizon = self.transfer.acting, self.cfg.planner.horizon
+        error = open_loop_error(model, rollout.steps, horizon)
+        found = audit(model, rollout.steps, self.cfg.task.discount, seed=number)
+        write_audit(self.folder / "audit.csv", number, rollout.steps, found.margin, self.env.task.observation_names)
+        metrics = {
+            "real_success": float(rollout.success),
+            "real_return": float(rollout.steps["next", "reward"].sum()),
+            "aborted": float(rollout.aborted is not None),
+            "audit_share": found.share,
+            **{f"model_error_{h + 1}": float(error[:, h].nanmean()) for h in range(min(horizon, len(error)))},
+        }
+        if rollout.plan_ms is not None:
+            metrics["planner_ms"] = float(rollout.plan_ms.mean())
+        if self.viewer:
+            self.viewer.episode(rollout, model, error, number, self.cfg.task.discount)
+        return metrics
+
+    def _evaluate(self, table: GrowingTable | None, metrics: dict[str, float]) -> None:
+        act = planner_policy(self.transfer.acting, self.planner, EVAL_SEED)
+        result: Score = score(collect(self.judge, act, seed=EVAL_SEED))
+        self.state["scores"][self.state["rollouts"]] = result._asdict()
+        metrics |= {"success": result.success, "return": result.episode_return}
+        if table:
+            table.row(
+                rollouts=self.state["rollouts"],
+                success=result.success,
+                **{"return": result.episode_return},
+                model_error=metrics.get("model_error_1"),
+                audit_share=metrics.get("audit_share"),
+                planner_ms=metrics.get("planner_ms"),
+                seconds=time.monotonic() - self.began,
+            )
+
+    def _save(self) -> None:
+        self.state["seconds"] = time.monotonic() - self.began
+        path = self.folder / "checkpoint"
+        meta = checkpoint.describe(self.cfg, self.transfer.acting)
+        checkpoint.save(path / "model.safetensors", self.transfer.acting, meta)
+        checkpoint.save_state(path / "state.pt", {"loop": self.state, "transfer": self.transfer.state_dict()})
+
+    def _resume(self) -> None:
+        path = self.folder / "checkpoint" / "state.pt"
+        if path.exists():
+            stored = checkpoint.load_state(path)
+            self.state = stored["loop"]
+            self.transfer.load_state_dict(stored["transfer"])
+
+    def _finish(self) -> int:
+        agent = self.transfer.agent
+        if agent.frozen_hash() != self.frozen:
+            raise AssertionError("a frozen tensor changed during deployment; this is a defect, please report it")
+        if self.viewer:
+            self.viewer.value_map("after", self.transfer.acting)
+            self.viewer.close()
+        scores, cfg = self.state["scores"], self.cfg
+        reached = [int(k) for k, s in scores.items() if s["success"] >= 0.9]
+        summary = {
+            "task": cfg.chosen.task,
+            "gap": cfg.chosen.gap,
+            "method": cfg.method,
+            "seed": cfg.seed,
+            "real_rollouts": self.state["rollouts"],
+            "aborted_rollouts": self.state["aborted"],
+            "zero_shot_success": scores[0]["success"],
+            "final_success": scores[max(scores)]["success"],
+            "final_interval": [scores[max(scores)]["success_low"], scores[max(scores)]["success_high"]],
+            "evaluation_episodes": cfg.eval_episodes,
+            "rollouts_to_90": min(reached) if reached else None,
+            "curve": {str(k): s["success"] for k, s in scores.items()},
+            "horizon": cfg.planner.horizon,
+            "frozen_sha256": self.frozen,
+            "wall_seconds": round(time.monotonic() - self.began, 1),
+            "rrd": str(self.folder / "run.rrd") if self.viewer else None,
+        }
+        (self.folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
+        self.logger.close()
+        print(json.dumps(summary))
+        return 0

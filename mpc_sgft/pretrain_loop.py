@@ -1,0 +1,142 @@
+"""The pretraining loop: collect a round of randomised episodes, learn from the buffer, measure, save."""
+
+import json
+import signal
+import time
+from pathlib import Path
+from types import FrameType
+
+import torch
+from hydra.utils import instantiate
+from omegaconf import DictConfig
+from tensordict import TensorDict
+from torch import Tensor
+
+from mpc_sgft import build, checkpoint, run_folder
+from mpc_sgft.agent import Agent
+from mpc_sgft.errors import Stopped, UserError
+from mpc_sgft.log import MetricLogger, progress
+from mpc_sgft.rollout import Act, collect, planner_policy, random_policy, score
+from planners.policy import PolicyPlanner
+
+EVAL_SEED = 1_000_000  # evaluation episodes never share a seed with collected ones
+
+
+def pretrain(cfg: DictConfig) -> int:
+    """Pretrain until the target success is held or the transitions are spent; returns the exit code."""
+    folder = run_folder.start(cfg)
+    torch.set_num_threads(cfg.torch_threads)
+    env = build.make_env(cfg, cfg.num_envs, randomised=True)
+    judge = build.make_env(cfg, cfg.eval_episodes, randomised=True)
+    agent = build.make_agent(cfg, env)
+    buffer = instantiate(cfg.train.replay, seed=cfg.seed)
+    state = {"round": 0, "updates": 0, "transitions": 0, "episodes": 0, "seconds": 0.0, "streak": 0}
+    saved = folder / "checkpoint" / "state.pt"
+    if cfg.resume is not None:
+        if not saved.is_file():
+            raise UserError(f"{folder} holds no checkpoint yet: nothing to resume. Start it again with run_dir=...")
+        stored = checkpoint.load_state(saved)
+        state = stored["loop"]
+        agent.load_state_dict(stored["agent"])
+        buffer.load_state_dict(stored["buffer"])
+
+    def save() -> None:
+        """Weights and exact state, at the end of a round."""
+        meta = checkpoint.describe(cfg, agent.model, extra={"transitions": state["transitions"]})
+        checkpoint.save(folder / "checkpoint" / "model.safetensors", agent.model, meta)
+        checkpoint.save_state(
+            saved, {"loop": state, "agent": agent.state_dict(), "buffer": buffer.state_dict()}
+        )
+
+    stop = StopRequest("round")
+    logger = MetricLogger(folder, csv=cfg.log.csv, tensorboard=cfg.log.tensorboard, wandb=cfg.log.wandb, resume_step=state["transitions"] if cfg.resume is not None else None)
+    bar = progress(cfg.transitions, initial=state["transitions"], desc="pretrain", disable=cfg.quiet)
+    result, began = None, time.monotonic() - state["seconds"]
+    while state["transitions"] < cfg.transitions:
+        first_round = state["transitions"] < cfg.random_transitions
+        act = random_policy(env, cfg.seed) if first_round else explorer(agent, cfg, state["round"])
+        data = collect(env, act, seed=_seed(cfg.seed, state["round"]), first_episode=state["episodes"])
+        buffer.extend(data)
+        state["transitions"] += data.numel()
+        state["episodes"] = int(data["episode"].max()) + 1
+        metrics: dict[str, float] = {"train_success": score(data).success}
+        owed = int(state["transitions"] * cfg.updates_per_transition) - state["updates"]
+        for _ in range(owed):
+            metrics |= agent.update(buffer.sample())
+        state["updates"] += owed
+        state["round"] += 1
+        if state["round"] % cfg.eval_every == 0 or state["transitions"] >= cfg.transitions:
+            result = score(collect(judge, prior(agent), seed=EVAL_SEED))
+            metrics |= {"success": result.success, "return": result.episode_return}
+            state["streak"] = state["streak"] + 1 if result.success >= cfg.target_success else 0
+        state["seconds"] = time.monotonic() - began
+        env_log = {"unstable": env.backend.counters["unstable"], "seconds": state["seconds"]}
+        logger.log(state["transitions"], {"updates": state["updates"], **metrics, **env_log})
+        bar.update(state["transitions"] - bar.n)
+        bar.set_postfix(success=f"{result.success:.0%}" if result else "-", loss=f"{metrics.get('loss', 0):.2f}")
+        done = state["streak"] >= cfg.target_streak and state["transitions"] >= cfg.min_transitions
+        if stop.asked or done or state["round"] % cfg.save_every == 0:
+            save()
+        if stop.asked:
+            raise Stopped(f"saved after {state['transitions']} transitions. Go on: python -m mpc_sgft.pretrain --resume {folder}")
+        if done:
+            break
+    save()
+    bar.close()
+    final = score(collect(judge, prior(agent), seed=EVAL_SEED + 1))
+    planner = build.make_planner(cfg, env.action_dim)
+    planned = score(collect(judge, planner_policy(agent.model, planner, cfg.seed), seed=EVAL_SEED + 1))
+    summary = {
+        "task": cfg.chosen.task,
+        "seed": cfg.seed,
+        "transitions": state["transitions"],
+        "updates": state["updates"],
+        "episodes_evaluated": final.episodes,
+        "success": final.success,
+        "success_interval": [final.success_low, final.success_high],
+        "planner_success": planned.success,
+        "return": final.episode_return,
+        "unstable_episodes": env.backend.counters["unstable"],
+        "wall_seconds": round(time.monotonic() - began, 1),
+        "checkpoint": str(folder / "checkpoint" / "model.safetensors"),
+    }
+    (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
+    logger.close()
+    print(json.dumps(summary))
+    return 0
+
+
+def explorer(agent: Agent, cfg: DictConfig, round_number: int) -> Act:
+    """The policy with its own noise; in a share of the environments more noise, so that the model sees mistakes."""
+    generator = torch.Generator().manual_seed(_seed(cfg.seed, round_number))
+    sample = planner_policy(agent.model, PolicyPlanner(action_dim=agent.model.action_dim, horizon=1), _seed(cfg.seed, round_number), explore=True)
+
+    def act(observation: Tensor, fresh: Tensor) -> Tensor:
+        action = sample(observation, fresh)
+        noisy = int(cfg.noisy_share * len(action))
+        action[:noisy] += cfg.extra_noise * torch.randn(noisy, action.shape[1], generator=generator)
+        return action.clamp(-1, 1)
+
+    return act
+
+
+def prior(agent: Agent) -> Act:
+    """The policy prior's mean action."""
+    return planner_policy(agent.model, PolicyPlanner(action_dim=agent.model.action_dim, horizon=1), 0)
+
+
+class StopRequest:
+    """Ctrl-C asks a loop to stop at the end of its round or rollout; a second one stops at once."""
+
+    def __init__(self, unit: str) -> None:
+        self.asked, self.unit = False, unit
+        self._before = signal.signal(signal.SIGINT, self._ask)
+
+    def _ask(self, number: int, frame: FrameType | None) -> None:
+        self.asked = True
+        signal.signal(signal.SIGINT, self._before)
+        print(f"\nstopping after this {self.unit}; once more stops at once", flush=True)
+
+
+def _seed(seed: int, round_number: int) -> int:
+    return (seed * 1_000_003 + round_number) % 2**31

@@ -1,0 +1,91 @@
+"""The SGFT potential: shaped rewards, and the audit that says whether shaping can work on the states seen.
+
+Source: Yin, Westenbroek et al., "Rapidly Adapting Policies to the Real World via Simulation-Guided Fine-Tuning", ICLR 2025, section 4 and Definition 1;
+Ng, Harada, Russell 1999 for potential-based shaping.
+"""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from planners.base import Model
+
+
+def shape_reward(reward: Tensor, value: Tensor, next_value: Tensor, terminated: Tensor, discount: float) -> Tensor:
+    """Reward plus the gain in potential.
+
+        rbar = r + gamma (1 - terminated) V(z') - V(z)
+
+    so that over a horizon sum_t gamma^t rbar_t = sum_t gamma^t r_t + gamma^H V(z_H) - V(z_0): shaping subtracts V(z_0) and adds a tail.
+
+    Args:
+        reward, value, next_value: Of any one shape, reward units.
+        terminated: Bool, the same shape; a terminal state has no value.
+        discount: gamma in [0, 1], per control step.
+    """
+    return reward + discount * torch.where(terminated, 0.0, next_value) - value
+
+
+class Audit(NamedTuple):
+    """Outcome of `improvable`."""
+
+    margin: Tensor  # [M] reward units; negative where no tried action satisfies Definition 1
+    share: float  # of the states with margin >= 0
+    action: Tensor  # [M, A] the best action found
+
+
+@torch.inference_mode()
+def improvable(
+    model: Model,
+    z: Tensor,
+    reward: Tensor,
+    *,
+    action_dim: int,
+    discount: float,
+    generator: torch.Generator,
+    num_prior: int = 16,
+    num_uniform: int = 48,
+    refinements: int = 3,
+) -> Audit:
+    """Where the frozen value can be improved by one step of the learned dynamics (Definition 1 of the paper).
+
+        margin(s) = max_a gamma V(next(z, a)) - V(z) + r(s)     >= 0 is what the paper asks of every state
+
+    The maximum is over samples: the policy's mean action, samples of the policy and of the whole action box, then rounds of samples around
+    the best one so far with half the spread of the round before. It is a lower bound, so a state called improvable is one (under the model).
+
+    Args:
+        model: Anything that satisfies `planners.base.Model`.
+        z: Latents of states really visited, terminal ones left out, [M, D].
+        reward: The task's reward at those states, [M].
+        action_dim: Entries of an action [A], in [-1, 1].
+        discount: gamma, per control step.
+        num_prior, num_uniform: Samples per state from the policy and from the box; also `num_uniform` in every refinement.
+        refinements: Rounds around the best action.
+
+    Raises:
+        ValueError: If z and reward do not agree in M or M is zero.
+    """
+    if z.ndim != 2 or reward.shape != z.shape[:1] or not len(z):
+        raise ValueError(f"improvable wants z [M, D] and reward [M] with M > 0, got {tuple(z.shape)} and {tuple(reward.shape)}.")
+    states, device = len(z), z.device
+
+    def normal(n: int) -> Tensor:
+        return torch.randn(n, states, action_dim, generator=generator, device=device)
+
+    def best_of(actions: Tensor) -> tuple[Tensor, Tensor]:  # [n, M, A]
+        value = model.terminal_value(model.next(z.expand(len(actions), -1, -1), actions))  # [n, M]
+        top, index = value.max(0)
+        return top, actions[index, torch.arange(states, device=device)]
+
+    prior = model.policy_prior(z.expand(num_prior, -1, -1), normal(num_prior)) if num_prior else normal(0)
+    box = 2 * torch.rand(num_uniform, states, action_dim, generator=generator, device=device) - 1
+    top, action = best_of(torch.cat([model.policy_prior(z, None).unsqueeze(0), prior, box]))
+    spread = 0.5
+    for _ in range(refinements):
+        around = (action + spread * normal(num_uniform)).clamp(-1, 1)
+        top, action = best_of(torch.cat([action.unsqueeze(0), around]))
+        spread /= 2
+    margin = discount * top - model.terminal_value(z) + reward
+    return Audit(margin, (margin >= 0).double().mean().item(), action)

@@ -1,0 +1,43 @@
+"""An episode as a film."""
+
+import os
+from pathlib import Path
+
+import torch
+
+from envs.env import ControlEnv
+from mpc_sgft.errors import UserError
+from mpc_sgft.rollout import Act
+
+SIZE = (480, 640)  # [pixels] height, width
+
+
+def write_video(path: Path, env: ControlEnv, act: Act, seed: int) -> Path:
+    """Film one episode of an environment of size 1 from its camera `side`, as MP4 at the control rate.
+
+    Raises:
+        UserError: If imageio's extra is not installed, or MuJoCo finds no way to draw here.
+    """
+    os.environ.setdefault("MUJOCO_GL", "egl")
+    try:
+        import imageio.v2 as imageio
+        import mujoco
+    except ImportError as error:
+        raise UserError(f"video=true needs imageio: pip install 'mpc_sgft[video]' ({error})") from error
+    model = env.backend.model
+    try:
+        renderer = mujoco.Renderer(model, *SIZE)
+    except (mujoco.FatalError, RuntimeError, AttributeError) as error:
+        raise UserError(f"MuJoCo cannot draw here ({error}); try MUJOCO_GL=osmesa or MUJOCO_GL=egl") from error
+    data = mujoco.MjData(model)
+    env.set_seed(seed)
+    state, fresh = env.reset(), torch.ones(1, dtype=torch.bool)
+    with renderer, imageio.get_writer(path, fps=round(1 / env.task.control_dt), macro_block_size=8) as film:
+        for _ in range(env.task.episode_steps):
+            state["action"] = act(state["observation"], fresh)
+            state, fresh = env.step(state)["next"], torch.zeros(1, dtype=torch.bool)
+            data.qpos[:] = env.backend.positions()
+            mujoco.mj_forward(model, data)
+            renderer.update_scene(data, camera="side")
+            film.append_data(renderer.render())
+    return path

@@ -1,0 +1,184 @@
+"""The TD-MPC2 world model with one addition, a state-value head. Satisfies `planners.base.Model` by having its methods.
+
+    z = encode(o)    z' = next(z, a)    r = reward(z, a, z')    V(z)    Q_e(z, a)    a = policy(z)    o = decode(z)
+
+Source: TD-MPC2, arXiv:2310.16828. V(z) is ours: the potential and terminal value of SGFT (Yin et al., ICLR 2025) must be one frozen,
+deterministic function of the latent; Q(z, pi(z)) would move with the policy that keeps training.
+"""
+
+import copy
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from mpc_sgft.layers import Ensemble, Normalizer, SimNorm, TwoHot, by_blocks, gaussian_tanh, mlp, simnorm
+
+PARTS = ("normalizer", "encoder", "dynamics", "reward_head", "q_ensemble", "target_q", "value_head", "policy_head", "decoder")
+REWARD_FROM = ("next", "current")
+LOG_STD_MIN, LOG_STD_MAX = -10.0, 2.0
+
+
+class Dynamics(nn.Module):
+    """Latent dynamics z' = SimNorm(f(z, a) [+ residual(z, a)]); the residual is absent until `add_residual`."""
+
+    def __init__(self, latent_dim: int, action_dim: int, mlp_dim: int, simnorm_dim: int) -> None:
+        super().__init__()
+        self.base = mlp([latent_dim + action_dim, mlp_dim, mlp_dim, latent_dim], out=nn.Identity())  # ends in LayerNorm
+        self.residual: nn.Module | None = None
+        self.simnorm_dim = simnorm_dim
+
+    def forward(self, z: Tensor, action: Tensor) -> Tensor:
+        x = torch.cat([z, action], -1)  # [..., D + A]
+        logits = self.base(x)
+        return simnorm(logits if self.residual is None else logits + self.residual(x), self.simnorm_dim)
+
+
+class WorldModel(nn.Module):
+    """Everything that is learned. All methods take any leading batch dimensions [...].
+
+    Args:
+        obs_dim: Entries of an observation, history included [O].
+        action_dim: Entries of an action [A].
+        decode_dim: Leading observation entries that `decode` returns (the raw observation without history).
+        latent_dim: Entries of the latent [D], a multiple of simnorm_dim.
+        mlp_dim, enc_dim: Hidden sizes of the heads and of the encoder.
+        enc_layers: Hidden layers of the encoder.
+        num_q: Members of the critic ensemble [E].
+        simnorm_dim: Entries of one SimNorm group.
+        num_bins, vmin, vmax: Two-hot bins of reward and value, on a symlog scale.
+        dropout: Probability on the first layer of every critic while training.
+        reward_from: "next": reward is read from the latent it is received in, so that it cannot hide the simulator's dynamics;
+            "current": from (z, a), as TD-MPC2 has it.
+
+    Raises:
+        ValueError: If latent_dim is no multiple of simnorm_dim, decode_dim exceeds obs_dim, num_q < 2, or reward_from is unknown.
+    """
+
+    def __init__(
+        self,
+        *,
+        obs_dim: int,
+        action_dim: int,
+        decode_dim: int,
+        latent_dim: int,
+        mlp_dim: int,
+        enc_dim: int,
+        enc_layers: int = 2,
+        num_q: int,
+        simnorm_dim: int = 8,
+        num_bins: int = 101,
+        vmin: float = -10.0,
+        vmax: float = 10.0,
+        dropout: float = 0.01,
+        reward_from: str = "next",
+    ) -> None:
+        self_sizes = {k: v for k, v in locals().items() if k not in ("self", "__class__")}
+        super().__init__()
+        if latent_dim % simnorm_dim:
+            raise ValueError(f"latent_dim={latent_dim} is not a multiple of simnorm_dim={simnorm_dim}.")
+        if not 1 <= decode_dim <= obs_dim:
+            raise ValueError(f"decode_dim={decode_dim} must lie between 1 and obs_dim={obs_dim}.")
+        if num_q < 2:
+            raise ValueError(f"num_q={num_q}: the target is the minimum of two critics, so at least 2 are needed.")
+        if reward_from not in REWARD_FROM:
+            raise ValueError(f"reward_from={reward_from!r}. Available: {', '.join(REWARD_FROM)}.")
+        self.sizes: dict[str, int | float | str] = self_sizes  # what rebuilds this model: WorldModel(**sizes)
+        self.obs_dim, self.action_dim, self.latent_dim = obs_dim, action_dim, latent_dim
+        self.num_q, self.reward_from = num_q, reward_from
+
+        pair = latent_dim + action_dim
+        self.two_hot = TwoHot(num_bins, vmin, vmax)
+        self.normalizer = Normalizer(obs_dim)
+        self.encoder = mlp([obs_dim, *[enc_dim] * enc_layers, latent_dim], out=SimNorm(simnorm_dim))
+        self.dynamics = Dynamics(latent_dim, action_dim, mlp_dim, simnorm_dim)
+        self.reward_head = mlp([pair, mlp_dim, mlp_dim, num_bins], zero_out=True)
+        self.q_ensemble = Ensemble(
+            mlp([pair, mlp_dim, mlp_dim, num_bins], dropout=dropout, zero_out=True) for _ in range(num_q)
+        )
+        self.target_q = copy.deepcopy(self.q_ensemble).requires_grad_(False)
+        self.value_head = mlp([latent_dim, mlp_dim, mlp_dim, num_bins], zero_out=True)
+        self.policy_head = mlp([latent_dim, mlp_dim, mlp_dim, 2 * action_dim])
+        self.decoder = mlp([latent_dim, mlp_dim, decode_dim])
+
+    # -- what a planner calls ------------------------------------------------------------------------------------------
+
+    def next(self, z: Tensor, action: Tensor) -> Tensor:
+        """Latent after `action` [..., A] in latent `z` [..., D]: [..., D]."""
+        return by_blocks(self.dynamics, z, action)
+
+    def reward(self, z: Tensor, action: Tensor, next_z: Tensor) -> Tensor:
+        """Expected reward of the transition, reward units, [...]."""
+        seen = next_z if self.reward_from == "next" else z
+        return by_blocks(lambda s, a: self.two_hot.decode(self.reward_head(torch.cat([s, a], -1))), seen, action)
+
+    def terminal_value(self, z: Tensor) -> Tensor:
+        """V(z), discounted reward units, [...]."""
+        return by_blocks(lambda s: self.two_hot.decode(self.value_head(s)), z)
+
+    def policy_prior(self, z: Tensor, noise: Tensor | None) -> Tensor:
+        """Action of the policy in [-1, 1], [..., A]; noise None gives tanh of the mean."""
+        mean, log_std = self._policy_moments(z)
+        return torch.tanh(mean if noise is None else mean + log_std.exp() * noise)
+
+    # -- what learning calls -------------------------------------------------------------------------------------------
+
+    def encode(self, observation: Tensor) -> Tensor:
+        """Latent of a raw observation, [..., O] -> [..., D]."""
+        return self.encoder(self.normalizer(observation))
+
+    def decode(self, z: Tensor) -> Tensor:
+        """Leading entries of the observation in raw units, [..., decode_dim]. Never trains the latent."""
+        return self.normalizer.inverse(self.decoder(z.detach()))
+
+    def reward_logits(self, z: Tensor, action: Tensor, next_z: Tensor) -> Tensor:
+        """Two-hot logits of the reward, [..., num_bins]."""
+        return self.reward_head(torch.cat([next_z if self.reward_from == "next" else z, action], -1))
+
+    def q_logits(self, z: Tensor, action: Tensor, *, target: bool = False, heads: Sequence[int] | None = None) -> Tensor:
+        """Two-hot logits of the chosen critics (all by default), [E, ..., num_bins]."""
+        return (self.target_q if target else self.q_ensemble)(torch.cat([z, action], -1), heads)
+
+    def q(self, z: Tensor, action: Tensor, *, target: bool = False, heads: Sequence[int] | None = None) -> Tensor:
+        """Q of the chosen critics (all by default), [E, ...]."""
+        return self.two_hot.decode(self.q_logits(z, action, target=target, heads=heads))
+
+    def policy(self, z: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+        """Reparameterised action [..., A] and its exact log-density [...]; noise is standard normal [..., A]."""
+        return gaussian_tanh(*self._policy_moments(z), noise)
+
+    def _policy_moments(self, z: Tensor) -> tuple[Tensor, Tensor]:
+        mean, log_std = self.policy_head(z).chunk(2, -1)
+        return mean, LOG_STD_MIN + 0.5 * (LOG_STD_MAX - LOG_STD_MIN) * (torch.tanh(log_std) + 1)
+
+    # -- changes of the model itself -----------------------------------------------------------------------------------
+
+    def add_residual(self, mlp_dim: int = 64) -> None:
+        """Freeze the dynamics and add a trainable correction to its logits that starts at exactly zero.
+
+        Raises:
+            ValueError: If there is one already.
+        """
+        if self.dynamics.residual is not None:
+            raise ValueError("The dynamics already have a residual; add_residual works once.")
+        self.dynamics.base.requires_grad_(False)
+        pair = self.latent_dim + self.action_dim
+        residual = mlp([pair, mlp_dim, self.latent_dim], zero_out=True)
+        self.dynamics.residual = residual.to(next(self.parameters()).device)
+
+    @torch.no_grad()
+    def update_targets(self, rate: float) -> None:
+        """Move the target critics toward the critics: target += rate (critic - target)."""
+        torch._foreach_lerp_(list(self.target_q.parameters()), list(self.q_ensemble.parameters()), rate)
+
+    def train(self, mode: bool = True) -> "WorldModel":
+        """Training mode (dropout in the critics); the target critics never drop out."""
+        super().train(mode)
+        self.target_q.eval()
+        return self
+
+    def __repr__(self) -> str:
+        count = {part: sum(p.numel() for p in getattr(self, part).parameters()) for part in PARTS}
+        lines = [f"  {part:<12}{n:>12,}" for part, n in count.items() if n]
+        total = sum(n for part, n in count.items() if part != "target_q")
+        return "\n".join([f"WorldModel({total:,} parameters without targets)", *lines])

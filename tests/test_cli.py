@@ -1,0 +1,264 @@
+"""The front of the commands, as a user meets it: help, names, exit codes, folders."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+from omegaconf import OmegaConf
+
+from mpc_sgft import choices, cli, compose, run_folder
+from mpc_sgft.errors import Stopped, UserError, from_config
+
+ROOT = Path(__file__).resolve().parents[1]
+COMMANDS = ("pretrain", "deploy", "evaluate")
+
+
+def probe(loop: str = "", name: str = "deploy") -> cli.Command:
+    """A command whose loop is a function of this file's helper module."""
+    return cli.Command(name=name, loop=f"probe_loop:{loop}", summary="", values={"method": ("sgft", "zero_shot")})
+
+
+@pytest.fixture
+def loops(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A module of small loops beside an empty working folder, which it returns."""
+    (tmp_path / "probe_loop.py").write_text(
+        "import errno\n"
+        "from mpc_sgft import run_folder\n"
+        "from mpc_sgft.errors import Stopped\n"
+        "def folder(cfg):\n    print(run_folder.start(cfg))\n"
+        "def show(cfg):\n    print(cfg.seed, cfg.chosen.gap, cfg.planner.horizon)\n"
+        "def stop(cfg):\n    raise Stopped('Saved. Go on with: --resume runs/x')\n"
+        "def full(cfg):\n    raise OSError(errno.ENOSPC, 'No space left on device', 'runs/x/metrics.csv')\n"
+        "def bug(cfg):\n    raise OSError(errno.EPIPE, 'Broken pipe')\n"
+    )
+    monkeypatch.syspath_prepend(str(tmp_path))
+    sys.modules.pop("probe_loop", None)
+    work = tmp_path / "work"
+    work.mkdir()
+    monkeypatch.chdir(work)
+    return work
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_help_lists_the_names_and_loads_nothing_heavy(name: str, tmp_path: Path) -> None:
+    code = (
+        "import sys; sys.argv = ['x', '--help']\n"
+        f"from mpc_sgft import {name}\n"
+        f"try: {name}.main()\n"
+        "except SystemExit as stop: assert stop.code == 0\n"
+        "heavy = {'torch', 'hydra', 'mujoco', 'rerun', 'numpy'}\n"
+        "print('LOADED', sorted({m.split('.')[0] for m in sys.modules} & heavy))\n"
+    )
+    env = {"PYTHONPATH": str(ROOT), "PATH": "/usr/bin"}
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, env=env, capture_output=True, text=True, timeout=60
+    )
+    assert done.returncode == 0, done.stderr
+    assert "LOADED []" in done.stdout
+    for group in ("task", "gap", "planner"):
+        options = ", ".join(choices.groups()[group])
+        assert options in re.sub(r",\s+", ", ", done.stdout), group
+    assert all(effect in done.stdout for effect in choices.effects())
+
+
+def test_groups_and_effects_are_the_files_on_disk() -> None:
+    assert {"task", "gap", "planner", "model", "backend", "experiment"} <= set(choices.groups())
+    assert "none" in choices.groups()["gap"]
+    assert "actuator_gain" in choices.effects() and "base" not in choices.effects()
+
+
+@pytest.mark.parametrize(
+    ("args", "parts"),
+    [
+        (["task=pusch"], ["unknown task 'pusch'", "Did you mean 'push'", "pendulum"]),
+        (["gap=nonne"], ["unknown gap 'nonne'", "none"]),
+        (["planner=mpii"], ["unknown planner 'mpii'", "mppi", "cem"]),
+        (["model=smal"], ["unknown model 'smal'", "small"]),
+        (["--backend", "ur5"], ["unknown backend 'ur5'", "franka, sim"]),
+        (["+experiment=debgu"], ["unknown experiment 'debgu'", "debug"]),
+        (["gap.effects.actuator_gian.gain=1"], ["unknown effect 'actuator_gian'", "actuator_gain", "sensor_delay"]),
+        (["sed=1"], ["unknown override 'sed'", "Did you mean 'seed'"]),
+        (["+foo=1"], ["unknown override 'foo'"]),
+        (["horzon=8"], ["unknown override 'horzon'", "Did you mean 'horizon'"]),
+        (["planner.horizn=8"], ["unknown key of planner 'horizn'", "Did you mean 'horizon'"]),
+        (["method=sgtf"], ["unknown method 'sgtf'", "sgft", "zero_shot"]),
+        (["device=gpu"], ["unknown device 'gpu'", "cuda"]),
+        (["seed=one"], ["a number is needed"]),
+        (["seed=-1"], ["a whole number"]),
+        (["seed=1,2"], ["Add -m"]),
+        (["task=null"], ["one task is needed"]),
+        (["randomize=push"], ["deploy has no randomize="]),
+        (["--bakend", "sim"], ["unknown flag '--bakend'", "--backend"]),
+        (["--seed"], ["--seed", "expected one argument"]),
+        (["push"], ["key=value"]),
+        (["--resume", "nowhere"], ["cannot resume nowhere", "config.yaml"]),
+        (["-m", "gap=none,nonne"], ["unknown gap 'nonne'"]),
+        (["-m", "run_dir=runs/a", "seed=1,2"], ["shared by all runs"]),
+    ],
+)
+def test_what_does_not_exist_is_one_line_and_exit_2(args: list[str], parts: list[str], capsys) -> None:
+    from mpc_sgft import deploy
+
+    assert deploy.main(args) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: ") and error.count("\n") == 1, error
+    for part in parts:
+        assert part in error
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_a_real_process_ends_with_2_and_no_traceback(name: str, command) -> None:
+    done = command(name, "task=pusch")
+    assert done.returncode == 2
+    assert "Traceback" not in done.stderr and done.stderr.startswith("error: unknown task 'pusch'")
+
+
+@pytest.mark.parametrize(
+    ("args", "shown"),
+    [
+        ([], "0 none 4"),
+        (["--seed", "3"], "3 none 4"),
+        (["horizon=8"], "0 none 8"),
+        (["planner.horizon=2", "planner=cem"], "0 none 2"),
+        (["+gap.effects.actuator_gain.gain=0.6"], "0 none+actuator_gain.gain=0.6 4"),
+        (["gap.effects.actuator_gain.gain=0.6", "gap=none"], "0 none+actuator_gain.gain=0.6 4"),
+    ],
+)
+def test_overrides_reach_the_loop(args: list[str], shown: str, loops: Path, capsys) -> None:
+    assert cli.run(probe("show"), args) == 0
+    assert capsys.readouterr().out.strip() == shown
+
+
+def test_a_sweep_runs_each_value(loops: Path, capfd) -> None:
+    assert cli.run(probe("show"), ["seed=1,2", "-m", "horizon=1"]) == 0
+    out = capfd.readouterr().out
+    assert "1 none 1" in out and "2 none 1" in out
+    assert [path.name for path in loops.iterdir()] == ["runs"]
+
+
+def test_a_sweep_passes_hydras_own_errors_on(loops: Path, capsys) -> None:
+    assert cli.run(probe("show"), ["seed=1,2", "-m", "hydra/launcher=nowhere"]) == 2
+    assert "hydra/launcher/nowhere" in capsys.readouterr().err
+
+
+def test_ctrl_c_shows_the_message_of_the_loop(loops: Path, capsys) -> None:
+    assert cli.run(probe("stop"), []) == 130
+    assert "Saved. Go on with: --resume runs/x" in capsys.readouterr().err
+
+
+def test_a_full_disk_is_a_clear_line(loops: Path, capsys) -> None:
+    assert cli.run(probe("full"), []) == 2
+    assert "runs/x/metrics.csv: the disk is full" in capsys.readouterr().err
+
+
+def test_errors_of_our_own_are_not_hidden(loops: Path) -> None:
+    with pytest.raises(BrokenPipeError):
+        cli.run(probe("bug"), [])
+
+
+def test_run_folder_holds_config_and_versions_and_is_the_latest(loops: Path, capsys) -> None:
+    assert cli.run(probe("folder"), ["task=pendulum", "seed=5"]) == 0
+    folder = Path(capsys.readouterr().out.strip())
+    assert folder.parent == loops / "runs" / "pendulum"
+    saved = yaml.safe_load((folder / "config.yaml").read_text())
+    assert (saved["seed"], saved["chosen"]["task"], saved["command"]) == (5, "pendulum", "deploy")
+    versions = json.loads((folder / "versions.json").read_text())
+    assert versions["torch"] and versions["mujoco"] and versions["cpu"]
+    assert (loops / "runs" / "latest").resolve() == (loops / "runs" / "pendulum" / "latest").resolve() == folder
+
+
+def test_runs_of_the_same_second_get_folders_of_their_own(loops: Path, capsys) -> None:
+    assert cli.run(probe("folder"), []) == cli.run(probe("folder"), []) == 0
+    first, second = capsys.readouterr().out.split()
+    assert first != second
+    assert (loops / "runs" / "latest").resolve() == Path(second)
+
+
+def test_a_folder_with_files_is_left_untouched(loops: Path, capsys) -> None:
+    (loops / "mine").mkdir()
+    (loops / "mine" / "summary.json").write_text("{}")
+    assert cli.run(probe("folder"), ["run_dir=mine"]) == 2
+    assert "already holds files" in capsys.readouterr().err
+    assert [p.name for p in (loops / "mine").iterdir()] == ["summary.json"]
+
+
+def test_a_run_dir_below_a_file_is_refused(loops: Path, capsys) -> None:
+    (loops / "file").write_text("")
+    assert cli.run(probe("folder"), ["run_dir=file/run"]) == 2
+    assert "Choose another place with run_dir=" in capsys.readouterr().err
+
+
+def test_resume_takes_the_saved_config_and_its_folder(loops: Path, capsys) -> None:
+    assert cli.run(probe("folder"), ["run_dir=first", "seed=7", "horizon=2"]) == 0
+    assert cli.run(probe("show"), ["--resume", "first"]) == 0
+    assert cli.run(probe("folder"), ["--resume", "first"]) == 0
+    assert capsys.readouterr().out.split("\n")[1:3] == ["7 none 2", str(loops / "first")]
+
+
+@pytest.mark.parametrize("change", ["task=pendulum", "seed=1", "gap.effects.payload.mass=1", "run_dir=other"])
+def test_resume_refuses_to_become_another_run(change: str, loops: Path, capsys) -> None:
+    assert cli.run(probe("folder"), ["run_dir=first"]) == 0
+    assert cli.run(probe("show"), ["--resume", "first", change]) == 2
+    assert "cannot change in a resumed run" in capsys.readouterr().err
+
+
+def test_resume_refuses_the_run_of_another_command(loops: Path, capsys) -> None:
+    assert cli.run(probe("folder"), ["run_dir=first"]) == 0
+    assert cli.run(probe("show", name="evaluate"), ["--resume", "first"]) == 2
+    assert "deploy wrote it" in capsys.readouterr().err
+
+
+def test_a_linked_checkpoint_is_followed_before_the_link_moves(loops: Path) -> None:
+    (loops / "old").mkdir()
+    (loops / "latest").symlink_to("old")
+    cfg = compose.compose("deploy", [compose.normalise("checkpoint=latest")], [])
+    assert cfg.checkpoint == str(loops / "old")
+
+
+def test_latest_that_is_no_link_is_not_replaced(loops: Path) -> None:
+    (loops / "runs" / "latest").mkdir(parents=True)
+    with pytest.raises(UserError, match="not a link"):
+        run_folder.start(compose.compose("deploy", [], []))
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+@pytest.mark.parametrize("experiment", choices.groups()["experiment"])
+def test_experiments_change_numbers_and_add_no_keys(name: str, experiment: str) -> None:
+    def keys(cfg, prefix: str = "") -> set[str]:
+        return (
+            set().union(*({prefix + k} | keys(v, f"{prefix}{k}.") for k, v in cfg.items()))
+            if isinstance(cfg, dict)
+            else set()
+        )
+
+    written = OmegaConf.to_container(OmegaConf.load(choices.CONFIG_DIR / "experiment" / f"{experiment}.yaml"))
+    assert isinstance(written, dict)
+    written.pop("defaults", None)
+    known: set[str] = set()
+    for each in COMMANDS:  # one experiment serves the three commands, which differ in their groups
+        known |= keys(OmegaConf.to_container(compose.compose(each, [], [])))
+    unknown = {key for key in keys(written) if key not in known and not key.startswith(("gap.effects.", "randomize."))}
+    assert not unknown
+    compose.compose(name, [f"+experiment={experiment}"], [])
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+@pytest.mark.parametrize("group", ["task", "gap", "planner", "model", "train", "randomize", "backend"])
+def test_every_option_of_every_group_composes(name: str, group: str) -> None:
+    for option in choices.groups_of(name).get(group, []):
+        cfg = compose.compose(name, [f"{group}={option}"], [])
+        assert cfg.chosen[group] == option
+
+
+def test_wrong_values_found_while_building_are_the_users() -> None:
+    with pytest.raises(UserError, match="planner: horizon=0: at least 1"), from_config("planner"):
+        raise ValueError("horizon=0: at least 1")
+    with pytest.raises(ZeroDivisionError), from_config("planner"):
+        raise ZeroDivisionError
+    assert issubclass(Stopped, KeyboardInterrupt)

@@ -1,0 +1,70 @@
+"""The picture of the project, kept true: who may import whom, read from every import statement."""
+
+from __future__ import annotations
+
+import ast
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+OURS = {"configs", "envs", "planners", "mpc_sgft", "tools", "tests"}
+MAY_IMPORT = {
+    "configs": set(),
+    "envs": {"envs"},
+    "planners": {"planners"},
+    "mpc_sgft": {"mpc_sgft", "envs", "planners"},
+    "tools": OURS - {"tests"},
+    "tests": OURS - {"tests"},
+}
+
+
+def imported(source: str) -> set[str]:
+    """Top-level names of everything a module imports; a relative import counts as "."."""
+    found = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            found |= {alias.name.split(".")[0] for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            found.add("." if node.level else (node.module or "").split(".")[0])
+    return found
+
+
+def files(room: str) -> list[Path]:
+    return sorted((ROOT / room).rglob("*.py"))
+
+
+@pytest.mark.parametrize("room", sorted(MAY_IMPORT))
+def test_imports_point_one_way(room: str) -> None:
+    wrong = []
+    for path in files(room):
+        for name in imported(path.read_text()):
+            if name == "." or (name in OURS and name not in MAY_IMPORT[room]):
+                wrong.append(f"{path.relative_to(ROOT)} imports {name}")
+    assert not wrong, wrong
+
+
+@pytest.mark.parametrize("room", ["envs", "planners"])
+def test_the_inner_rooms_know_no_hydra(room: str) -> None:
+    wrong = [str(p.relative_to(ROOT)) for p in files(room) if imported(p.read_text()) & {"hydra", "omegaconf"}]
+    assert not wrong, wrong
+
+
+def test_planners_need_nothing_but_torch() -> None:
+    allowed = sys.stdlib_module_names | {"torch", "planners"}
+    wrong = {str(p.relative_to(ROOT)): extra for p in files("planners") if (extra := imported(p.read_text()) - allowed)}
+    assert not wrong, wrong
+
+
+def test_every_package_on_disk_is_in_the_wheel() -> None:
+    listed = set(tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["packages"])
+    rooms = ("configs", "envs", "planners", "mpc_sgft")
+    found = {".".join(p.parent.relative_to(ROOT).parts) for room in rooms for p in files(room)}
+    assert listed == found
+
+
+def test_the_reader_of_imports_sees_them_all() -> None:
+    source = "import a.b\ndef f():\n    from c.d import e\nfrom . import g\n"
+    assert imported(source) == {"a", "c", "."}
