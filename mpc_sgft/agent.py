@@ -3,13 +3,14 @@
 import copy
 import hashlib
 from collections.abc import Mapping
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Protocol
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
 from mpc_sgft import losses
+from mpc_sgft.slices import check_finite, to_slices
 from mpc_sgft.world_model import WorldModel
 from planners.base import Model, Plan
 
@@ -19,15 +20,6 @@ METHODS = {  # the parts that train at transfer
     "zero_shot": (),
 }
 PRETRAINED = METHODS["tdmpc2"]
-
-
-class Slices(NamedTuple):
-    """A batch of the buffer, time first."""
-
-    observation: Tensor  # [T + 1, B, O]
-    action: Tensor  # [T, B, A]
-    reward: Tensor  # [T, B]
-    terminated: Tensor  # [T, B] bool
 
 
 class Planner(Protocol):
@@ -138,9 +130,7 @@ class Agent:
             bad = (~observation.isfinite()).nonzero()[0].tolist()
             raise FloatingPointError(f"observation is not finite, first at [environment, entry] = {bad}.")
         z = self.model.encode(observation)
-        return planner.plan(
-            self.model, z, previous, fresh, generator, keep_candidates=keep_candidates, explore=explore
-        )
+        return planner.plan(self.model, z, previous, fresh, generator, keep_candidates=keep_candidates, explore=explore)
 
     # -- learning in simulation ----------------------------------------------------------------------------------------
 
@@ -148,9 +138,9 @@ class Agent:
         """One step of the TD-MPC2 objective with a value head, on slices [B, T]; returns metrics.
 
         Raises:
-            FloatingPointError: If a loss is not finite; nothing has been changed then.
+            FloatingPointError: If an entry of the batch or a loss is not finite; no parameter has been changed then.
         """
-        model, data = self.model, self._slices(batch)
+        model, data = self.model, to_slices(batch, self.device)
         if self.method is None:
             model.normalizer.update(data.observation[0])
         first_z = model.encode(data.observation[0])  # [B, D], trains the encoder
@@ -180,7 +170,7 @@ class Agent:
         }
         metrics = {name: losses.over_time(loss, self.rho) for name, loss in per_step.items()}
         total = torch.stack([self.weights[name] * loss for name, loss in metrics.items()]).sum()
-        self._check(metrics)
+        check_finite(metrics)
         metrics["loss"] = total
         self.model_optimizer.zero_grad()
         total.backward()
@@ -202,7 +192,7 @@ class Agent:
         return self._step_policy(loss, log_prob) | {"entropy_coef": coef, "scale": scale}
 
     def _step_policy(self, loss: Tensor, log_prob: Tensor) -> dict[str, Tensor]:
-        self._check({"policy_loss": loss})
+        check_finite({"policy_loss": loss})
         parameters = list(self.model.policy_head.parameters())
         self.policy_optimizer.zero_grad()
         loss.backward(inputs=parameters)  # the critics and the dynamics collect no gradient here
@@ -224,7 +214,8 @@ class Agent:
         Args:
             method: sgft | tdmpc2 | zero_shot.
             horizon: Imagined steps of the policy's SGFT objective [H].
-            anchor: Weight of the squared distance of the dynamics' parameters from the pretrained ones; None: as configured.
+            anchor: Weight of the squared distance of the dynamics' parameters from the pretrained ones beside their
+                consistency loss; None: as configured.
             residual: Train a correction on top of frozen pretrained dynamics; None: as configured.
 
         Raises:
@@ -262,29 +253,31 @@ class Agent:
 
         Raises:
             ValueError: If nothing trains (method zero_shot, or freeze_for_transfer was not called).
-            FloatingPointError: If a loss is not finite; that loss has changed nothing then.
+            FloatingPointError: If an entry of the batch or a loss is not finite; that loss has changed nothing then.
         """
         if self.method == "tdmpc2":
             return self.update(batch)
         if self.method != "sgft":
-            raise ValueError(f"update_transfer needs freeze_for_transfer('sgft') or ('tdmpc2') first; method is {self.method!r}.")
-        data = self._slices(batch)
+            raise ValueError(
+                f"update_transfer needs freeze_for_transfer('sgft') or ('tdmpc2') first; method is {self.method!r}."
+            )
+        data = to_slices(batch, self.device)
         with torch.no_grad():
             encoded = self.model.encode(data.observation)  # [T + 1, B, D]
         zs = self._imagine(encoded[0], data.action)
         loss = losses.over_time(losses.consistency_loss(zs[1:], encoded[1:]), self.rho, weight)
         metrics = {"consistency_loss": loss}
         if self.anchor:
-            difference = torch._foreach_sub(self._model_parameters, self._anchored)
-            metrics["anchor_distance"] = torch.stack([d.square().sum() for d in difference]).sum()
+            moved = zip(self._model_parameters, self._anchored, strict=True)
+            metrics["anchor_distance"] = torch.stack([(now - then).square().sum() for now, then in moved]).sum()
             loss = loss + self.anchor * metrics["anchor_distance"]
-        self._check(metrics)
+        check_finite(metrics)
         self.model_optimizer.zero_grad()
         (self.weights["consistency_loss"] * loss).backward()
         metrics["grad_norm"] = torch.nn.utils.clip_grad_norm_(self._model_parameters, self.grad_clip, foreach=True)
         self.model_optimizer.step()
 
-        starts = encoded[:-1].flatten(0, 1)  # [T B, D], never terminal: nothing follows a terminal state in its slice
+        starts = encoded[0]  # [B, D]
         noise = self._noise(self.horizon, len(starts))
         objective, log_prob = losses.imagined_objective(self.model, starts, noise, self.discount)
         scale = self.scale.update(objective.detach())
@@ -295,7 +288,7 @@ class Agent:
     @torch.no_grad()
     def model_error(self, batch: TensorDictBase) -> Tensor:
         """Squared latent error of the dynamics after 1..T open-loop steps, mean over the latent, [B, T]."""
-        data = self._slices(batch)
+        data = to_slices(batch, self.device)
         encoded = self.model.encode(data.observation)
         zs = self._imagine(encoded[0], data.action)
         return losses.consistency_loss(zs[1:], encoded[1:]).transpose(0, 1)
@@ -370,13 +363,6 @@ class Agent:
     def _trains(self, name: str) -> bool:
         return any(name.startswith(part + ".") for part in self.trainable)
 
-    def _slices(self, batch: TensorDictBase) -> Slices:
-        following = batch["next"]
-        observation = torch.cat([batch["observation"][:, :1], following["observation"]], 1).transpose(0, 1)
-        reward, terminated = following["reward"].squeeze(-1), following["terminated"].squeeze(-1)
-        parts = (observation, batch["action"].transpose(0, 1), reward.t(), terminated.t())
-        return Slices(*(x.to(self.device) for x in parts))
-
     def _imagine(self, z: Tensor, actions: Tensor) -> Tensor:
         zs = [z]
         for action in actions:
@@ -392,12 +378,6 @@ class Agent:
 
     def _two_heads(self) -> list[int]:
         return torch.randperm(self.model.num_q, generator=self.generator, device=self.device)[:2].tolist()
-
-    def _check(self, values: Mapping[str, Tensor]) -> None:
-        finite = torch.stack([v.detach() for v in values.values()]).isfinite().tolist()
-        if not all(finite):
-            bad = [name for name, ok in zip(values, finite, strict=True) if not ok]
-            raise FloatingPointError(f"{', '.join(bad)} is not finite; this update was not applied.")
 
 
 def _floats(metrics: Mapping[str, Tensor]) -> dict[str, float]:

@@ -1,7 +1,8 @@
 """Replay of slices of consecutive steps, on TorchRL's storage.
 
-TorchRL's own SliceSampler crosses episodes on flat storages and is uniform over trajectories, not over frames; this sampler keeps, for every
-stored row, the rows before and after it in the same episode, and draws uniformly over the rows from which T consecutive steps follow.
+TorchRL's own SliceSampler crosses episodes on flat storages and is uniform over trajectories, not over frames; this
+sampler keeps, for every stored row, the rows before and after it in the same episode, and draws uniformly over the rows
+from which T consecutive steps follow.
 """
 
 from typing import Any
@@ -19,8 +20,9 @@ ROWS = ("previous", "following", "episode", "valid")
 class SliceSampler(Sampler):
     """Uniform over all starts of `slice_len` consecutive steps of one episode.
 
-    Rows are linked by (episode, step), not by where they lie, so an episode may arrive in pieces and between other environments' rows, and a
-    ring buffer may wrap through it. An episode with fewer than `slice_len` stored steps contributes nothing.
+    Rows are linked by (episode, step), not by where they lie, so an episode may arrive in pieces and between other
+    environments' rows, and a ring buffer may wrap through it. An episode with fewer than `slice_len` stored steps
+    contributes nothing.
 
     Args:
         capacity: Rows of the storage.
@@ -89,7 +91,8 @@ class SliceSampler(Sampler):
             self._starts = self.valid.nonzero().flatten()
         if not len(self._starts):
             raise ValueError(
-                f"The buffer holds {len(storage)} steps but no {self.slice_len} consecutive steps of one episode; collect more before sampling."
+                f"The buffer holds {len(storage)} steps but no {self.slice_len} consecutive steps of one episode; "
+                "collect more before sampling."
             )
         row = self._starts[torch.randint(len(self._starts), (batch_size,), generator=self.generator)]
         rows = [row]
@@ -143,7 +146,9 @@ class SliceBuffer:
         if invalid is not None and invalid.any():
             flat = flat[~invalid.reshape(-1)]
         if len(flat) > self.capacity:
-            raise ValueError(f"{len(flat)} transitions do not fit a buffer of {self.capacity}; extend in smaller pieces.")
+            raise ValueError(
+                f"{len(flat)} transitions do not fit a buffer of {self.capacity}; extend in smaller pieces."
+            )
         if len(flat):
             index = self._replay.extend(flat, update_priority=False)
             self.sampler.link(index, flat["episode"].cpu(), flat["step"].cpu())
@@ -158,7 +163,7 @@ class SliceBuffer:
 
     def state_dict(self) -> dict[str, Any]:
         """Everything needed to go on with the same samples; plain tensors and numbers."""
-        data = self._replay.storage.get(slice(0, len(self))).flatten_keys("/") if len(self) else {}
+        data = self._replay[:].flatten_keys("/") if len(self) else {}
         writer = self._replay.writer.state_dict()
         return {"data": {k: v.clone() for k, v in data.items()}, "writer": writer, "sampler": self.sampler.state_dict()}
 
@@ -170,12 +175,14 @@ class SliceBuffer:
         """
         rows = len(state["sampler"]["valid"])
         if rows != self.capacity:
-            raise ValueError(f"The saved buffer holds {rows} rows, this one {self.capacity}; keep the capacity when resuming.")
+            raise ValueError(
+                f"The saved buffer holds {rows} rows, this one {self.capacity}; keep the capacity when resuming."
+            )
         self._replay.empty()
         if state["data"]:
             n = len(next(iter(state["data"].values())))
             data = TensorDict(state["data"], batch_size=[n]).unflatten_keys("/")
-            self._replay.storage.set(torch.arange(n), data)
+            self._replay.storage.set(torch.arange(n), data)  # type: ignore[arg-type]
         self._replay.writer.load_state_dict(state["writer"])
         self.sampler.load_state_dict(state["sampler"])
 
@@ -193,5 +200,8 @@ def make_buffer(capacity: int, slice_len: int, batch_size: int, seed: int) -> Sl
         ValueError: If capacity < slice_len or a number is not positive.
     """
     if not 1 <= slice_len <= capacity or batch_size < 1:
-        raise ValueError(f"make_buffer wants 1 <= slice_len <= capacity and batch_size >= 1, got {slice_len}, {capacity}, {batch_size}.")
+        raise ValueError(
+            "make_buffer wants 1 <= slice_len <= capacity and batch_size >= 1, "
+            f"got slice_len={slice_len}, capacity={capacity}, batch_size={batch_size}."
+        )
     return SliceBuffer(capacity, slice_len, batch_size, seed)

@@ -14,6 +14,7 @@ from mpc_sgft import checkpoint
 from mpc_sgft.agent import Agent
 from mpc_sgft.errors import UserError, from_config
 from mpc_sgft.world_model import WorldModel
+from planners.memory import keep_freed_memory
 
 
 def device(cfg: DictConfig) -> torch.device:
@@ -25,6 +26,12 @@ def device(cfg: DictConfig) -> torch.device:
     if cfg.device == "cuda" and not torch.cuda.is_available():
         raise UserError("device=cuda, but PyTorch finds no CUDA device here. Use device=cpu or device=auto.")
     return torch.device("cuda" if cfg.device != "cpu" and torch.cuda.is_available() else "cpu")
+
+
+def prepare_process(cfg: DictConfig) -> None:
+    """Threads and memory of this process, for speed; call once at the start."""
+    torch.set_num_threads(cfg.torch_threads)
+    keep_freed_memory()
 
 
 def make_env(cfg: DictConfig, num_envs: int, *, randomised: bool = False) -> ControlEnv:

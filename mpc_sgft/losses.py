@@ -1,8 +1,10 @@
 """Objectives of the world model: tensors in, tensors out, no state but RunningScale.
 
-Shapes are time first: [T, B, ...], T steps of a slice, B slices. A loss per step and slice becomes a scalar through `over_time`.
+Shapes are time first: [T, B, ...], T steps of a slice, B slices. A loss per step and slice becomes a scalar through
+`over_time`.
 
-Source: TD-MPC2, arXiv:2310.16828, equations 3 to 5; entropy coefficient: SAC, arXiv:1812.05905; transfer objective: SGFT (Yin et al., ICLR 2025).
+Source: TD-MPC2, arXiv:2310.16828; entropy coefficient: SAC, arXiv:1812.05905; transfer objective: SGFT (Yin et al.,
+ICLR 2025).
 """
 
 import torch

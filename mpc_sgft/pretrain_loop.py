@@ -25,7 +25,7 @@ EVAL_SEED = 1_000_000  # evaluation episodes never share a seed with collected o
 def pretrain(cfg: DictConfig) -> int:
     """Pretrain until the target success is held or the transitions are spent; returns the exit code."""
     folder = run_folder.start(cfg)
-    torch.set_num_threads(cfg.torch_threads)
+    build.prepare_process(cfg)
     env = build.make_env(cfg, cfg.num_envs, randomised=True)
     judge = build.make_env(cfg, cfg.eval_episodes, randomised=True)
     agent = build.make_agent(cfg, env)
@@ -83,7 +83,8 @@ def pretrain(cfg: DictConfig) -> int:
             break
     save()
     bar.close()
-    final = score(collect(judge, prior(agent), seed=EVAL_SEED + 1))
+    final_judge = build.make_env(cfg, cfg.final_episodes, randomised=True)
+    final = score(collect(final_judge, prior(agent), seed=EVAL_SEED + 1))
     planner = build.make_planner(cfg, env.action_dim)
     planned = score(collect(judge, planner_policy(agent.model, planner, cfg.seed), seed=EVAL_SEED + 1))
     summary = {

@@ -81,6 +81,7 @@ def _link(link: Path, folder: Path) -> None:
     """Point a link at the folder, in one step, so that a reader never finds it missing."""
     if link.exists() and not link.is_symlink():
         raise UserError(f"{link} is not a link to the newest run but a file or folder of its own. Move it away.")
+    link.parent.mkdir(parents=True, exist_ok=True)
     fresh = link.with_name(f".latest-{os.getpid()}")
     fresh.unlink(missing_ok=True)
     fresh.symlink_to(os.path.relpath(folder, link.parent), target_is_directory=True)

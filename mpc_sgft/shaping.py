@@ -1,7 +1,7 @@
 """The SGFT potential: shaped rewards, and the audit that says whether shaping can work on the states seen.
 
-Source: Yin, Westenbroek et al., "Rapidly Adapting Policies to the Real World via Simulation-Guided Fine-Tuning", ICLR 2025, section 4 and Definition 1;
-Ng, Harada, Russell 1999 for potential-based shaping.
+Source: Yin, Westenbroek et al., "Rapidly Adapting Policies to the Real World via Simulation-Guided Fine-Tuning", ICLR
+2025, Definition 1; Ng, Harada, Russell 1999 for potential-based shaping.
 """
 
 from typing import NamedTuple
@@ -17,7 +17,7 @@ def shape_reward(reward: Tensor, value: Tensor, next_value: Tensor, terminated: 
 
         rbar = r + gamma (1 - terminated) V(z') - V(z)
 
-    so that over a horizon sum_t gamma^t rbar_t = sum_t gamma^t r_t + gamma^H V(z_H) - V(z_0): shaping subtracts V(z_0) and adds a tail.
+    so that sum_{t<H} gamma^t rbar_t = sum_{t<H} gamma^t r_t + gamma^H V(z_H) - V(z_0): V(z_0) off, a tail on.
 
     Args:
         reward, value, next_value: Of any one shape, reward units.
@@ -52,8 +52,9 @@ def improvable(
 
         margin(s) = max_a gamma V(next(z, a)) - V(z) + r(s)     >= 0 is what the paper asks of every state
 
-    The maximum is over samples: the policy's mean action, samples of the policy and of the whole action box, then rounds of samples around
-    the best one so far with half the spread of the round before. It is a lower bound, so a state called improvable is one (under the model).
+    The maximum is over samples: the policy's mean action, samples of the policy and of the whole action box, then
+    rounds of samples around the best one so far with half the spread of the round before. It is a lower bound, so a
+    state called improvable is one (under the model).
 
     Args:
         model: Anything that satisfies `planners.base.Model`.
@@ -61,14 +62,16 @@ def improvable(
         reward: The task's reward at those states, [M].
         action_dim: Entries of an action [A], in [-1, 1].
         discount: gamma, per control step.
-        num_prior, num_uniform: Samples per state from the policy and from the box; also `num_uniform` in every refinement.
+        num_prior, num_uniform: Samples per state from the policy and from the box; a refinement has `num_uniform` too.
         refinements: Rounds around the best action.
 
     Raises:
         ValueError: If z and reward do not agree in M or M is zero.
     """
     if z.ndim != 2 or reward.shape != z.shape[:1] or not len(z):
-        raise ValueError(f"improvable wants z [M, D] and reward [M] with M > 0, got {tuple(z.shape)} and {tuple(reward.shape)}.")
+        raise ValueError(
+            f"improvable wants z [M, D] and reward [M] with M > 0, got {tuple(z.shape)} and {tuple(reward.shape)}."
+        )
     states, device = len(z), z.device
 
     def normal(n: int) -> Tensor:

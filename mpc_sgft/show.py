@@ -17,6 +17,21 @@ from planners.base import imagine
 GRID = 41  # points of the value map along each axis
 
 
+def layout(env: ControlEnv) -> Layout:
+    """Where the viewer's cameras stand for a task."""
+    if "object" in env.task.points(np.zeros((1, env.raw_dim))):
+        return Layout(
+            eye=(1.18, -0.76, 0.46),
+            target=(0.385, 0.02, 0.025),
+            second_eye=(0.43, 0.0, 0.42),
+            second_target=(0.43, 0.0, -0.15),
+            object_radius=0.025,
+            object_height=0.03,
+            metrics=("success",),
+        )
+    return Layout(eye=(0.0, -3.0, 0.0), second_eye=(0.0, -3.0, 0.0), value_maps=(), metrics=("success",))
+
+
 class DeployViewer:
     """Writes run.rrd of a deployment. The ghost is decoded from the latent by the model's decoder head.
 
@@ -29,7 +44,7 @@ class DeployViewer:
     def __init__(self, path: Path, env: ControlEnv, *, resume: bool):
         self.env, self.task = env, env.task
         model = getattr(env.backend, "model", None)
-        self.viewer = RunViewer(path, model, control_dt=env.task.control_dt, layout=Layout(), resume=resume)
+        self.viewer = RunViewer(path, model, control_dt=env.task.control_dt, layout=layout(env), resume=resume)
         self.limits: tuple[float, float] | None = None
 
     def episode(self, rollout: Rollout, model: WorldModel, error: Tensor, number: int, discount: float) -> None:
@@ -78,6 +93,10 @@ class DeployViewer:
         grid = values.cpu().numpy().reshape(GRID, GRID)
         self.limits = self.limits or (float(grid.min()), float(grid.max()))
         self.viewer.value_map(name, grid, extent, marks={"puck": puck}, limits=self.limits)
+
+    def success(self, share: float) -> None:
+        """Add the success of an evaluation."""
+        self.viewer.metrics(self.viewer.env_step, {"success": share})
 
     def close(self) -> None:
         self.viewer.close()

@@ -2,8 +2,8 @@
 
     z = encode(o)    z' = next(z, a)    r = reward(z, a, z')    V(z)    Q_e(z, a)    a = policy(z)    o = decode(z)
 
-Source: TD-MPC2, arXiv:2310.16828. V(z) is ours: the potential and terminal value of SGFT (Yin et al., ICLR 2025) must be one frozen,
-deterministic function of the latent; Q(z, pi(z)) would move with the policy that keeps training.
+Source: TD-MPC2, arXiv:2310.16828. V(z) is ours: the potential and terminal value of SGFT (Yin et al., ICLR 2025) must
+be one frozen, deterministic function of the latent; Q(z, pi(z)) would move with the policy that keeps training.
 """
 
 import copy
@@ -14,7 +14,17 @@ from torch import Tensor, nn
 
 from mpc_sgft.layers import Ensemble, Normalizer, SimNorm, TwoHot, by_blocks, gaussian_tanh, mlp, simnorm
 
-PARTS = ("normalizer", "encoder", "dynamics", "reward_head", "q_ensemble", "target_q", "value_head", "policy_head", "decoder")
+PARTS = (
+    "normalizer",
+    "encoder",
+    "dynamics",
+    "reward_head",
+    "q_ensemble",
+    "target_q",
+    "value_head",
+    "policy_head",
+    "decoder",
+)
 REWARD_FROM = ("next", "current")
 LOG_STD_MIN, LOG_STD_MAX = -10.0, 2.0
 
@@ -48,11 +58,12 @@ class WorldModel(nn.Module):
         simnorm_dim: Entries of one SimNorm group.
         num_bins, vmin, vmax: Two-hot bins of reward and value, on a symlog scale.
         dropout: Probability on the first layer of every critic while training.
-        reward_from: "next": reward is read from the latent it is received in, so that it cannot hide the simulator's dynamics;
-            "current": from (z, a), as TD-MPC2 has it.
+        reward_from: "next": reward is read from the latent it is received in, so that it cannot hide the simulator's
+            dynamics; "current": from (z, a), as TD-MPC2 has it.
 
     Raises:
-        ValueError: If latent_dim is no multiple of simnorm_dim, decode_dim exceeds obs_dim, num_q < 2, or reward_from is unknown.
+        ValueError: If latent_dim is no multiple of simnorm_dim, decode_dim exceeds obs_dim, num_q < 2, or reward_from
+            is unknown.
     """
 
     def __init__(
@@ -125,7 +136,7 @@ class WorldModel(nn.Module):
 
     def encode(self, observation: Tensor) -> Tensor:
         """Latent of a raw observation, [..., O] -> [..., D]."""
-        return self.encoder(self.normalizer(observation))
+        return by_blocks(lambda o: self.encoder(self.normalizer(o)), observation)
 
     def decode(self, z: Tensor) -> Tensor:
         """Leading entries of the observation in raw units, [..., decode_dim]. Never trains the latent."""
@@ -135,7 +146,9 @@ class WorldModel(nn.Module):
         """Two-hot logits of the reward, [..., num_bins]."""
         return self.reward_head(torch.cat([next_z if self.reward_from == "next" else z, action], -1))
 
-    def q_logits(self, z: Tensor, action: Tensor, *, target: bool = False, heads: Sequence[int] | None = None) -> Tensor:
+    def q_logits(
+        self, z: Tensor, action: Tensor, *, target: bool = False, heads: Sequence[int] | None = None
+    ) -> Tensor:
         """Two-hot logits of the chosen critics (all by default), [E, ..., num_bins]."""
         return (self.target_q if target else self.q_ensemble)(torch.cat([z, action], -1), heads)
 
@@ -148,7 +161,7 @@ class WorldModel(nn.Module):
         return gaussian_tanh(*self._policy_moments(z), noise)
 
     def _policy_moments(self, z: Tensor) -> tuple[Tensor, Tensor]:
-        mean, log_std = self.policy_head(z).chunk(2, -1)
+        mean, log_std = by_blocks(self.policy_head, z).chunk(2, -1)
         return mean, LOG_STD_MIN + 0.5 * (LOG_STD_MAX - LOG_STD_MIN) * (torch.tanh(log_std) + 1)
 
     # -- changes of the model itself -----------------------------------------------------------------------------------
@@ -169,7 +182,8 @@ class WorldModel(nn.Module):
     @torch.no_grad()
     def update_targets(self, rate: float) -> None:
         """Move the target critics toward the critics: target += rate (critic - target)."""
-        torch._foreach_lerp_(list(self.target_q.parameters()), list(self.q_ensemble.parameters()), rate)
+        for target, critic in zip(self.target_q.parameters(), self.q_ensemble.parameters(), strict=True):
+            target.lerp_(critic, rate)
 
     def train(self, mode: bool = True) -> "WorldModel":
         """Training mode (dropout in the critics); the target critics never drop out."""

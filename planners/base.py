@@ -129,13 +129,13 @@ def check_discount(discount: float) -> None:
 def check_finite(who: str, what: str, x: Tensor) -> None:
     """Raise FloatingPointError that names `what` and the environments in which x [B, ...] is not finite."""
     if not torch.isfinite(x).all():
-        bad = (~torch.isfinite(x).flatten(1).all(1)).nonzero().flatten().tolist()
+        bad = (~torch.isfinite(x).reshape(len(x), -1).all(1)).nonzero().flatten().tolist()
         some = ", ".join(map(str, bad[:8])) + (", ..." if len(bad) > 8 else "")
         raise FloatingPointError(f"{who}: {what} are non-finite (env {some}).")
 
 
 def check_followed(who: str, latents: Tensor, actions: Tensor) -> None:
-    """Raise FloatingPointError that tells a policy prior from a model that left the finite numbers in `imagine_policy`."""
+    """Check what `imagine_policy` returned, and tell whether policy prior or model left the finite numbers."""
     check_finite(who, "policy-prior actions", actions[..., :1, :])
     check_finite(who, "imagined latents", latents)
     check_finite(who, "policy-prior actions", actions)

@@ -12,7 +12,8 @@ from planners.sampling import SamplingPlanner
 class CEM(SamplingPlanner):
     """`SamplingPlanner` whose refit is the plain mean and standard deviation of the elites, w_k = 1 / K.
 
-    Source: Rubinstein and Kroese, The Cross-Entropy Method, 2004; for planning in latent space PlaNet, arXiv:1811.04551.
+    Source: Rubinstein and Kroese, The Cross-Entropy Method, 2004; in latent space
+    PlaNet, arXiv:1811.04551.
     """
 
     def weights(self, values: Tensor) -> Tensor:

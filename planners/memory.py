@@ -10,8 +10,8 @@ LARGEST_KEPT = 32 * 1024 * 1024  # bytes; glibc allows no more
 def keep_freed_memory() -> bool:
     """Tell glibc's malloc not to hand freed memory back to the operating system; call once, at the start of a program.
 
-    By default every large intermediate tensor is returned and fetched again page by page, which costs a plan 10-25 % of its
-    time on a CPU (results/time_planner.csv, column `kept`). The process then keeps its peak size.
+    By default every large intermediate tensor is returned and fetched again page by page, which costs a plan 10-25 % of
+    its time on a CPU (tools/time_planner.py --default-malloc). The process then keeps its peak size.
 
     Returns:
         Whether it worked; False where the C library is another one, and nothing has changed then.

@@ -1,4 +1,4 @@
-"""What MPPI and CEM share: sample plans around a mean, imagine them, move the mean toward the best, a few times over."""
+"""What MPPI and CEM share: sample plans around a mean, imagine them, move the mean toward the best, and again."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -20,15 +20,15 @@ from planners.base import (
 
 @dataclass(frozen=True, kw_only=True)
 class SamplingPlanner(ABC):
-    """Iterated sampling over plans [H, A], batched over environments; a concrete planner says how elites are weighted.
+    """Iterated sampling over plans [H, A], batched over environments; a concrete planner says how elites weigh.
 
-    Each iteration draws num_candidates - num_prior plans from N(mean, std), adds the plans of the policy prior (imagined and
-    valued once), keeps the num_elites best and refits
+    Each iteration draws num_candidates - num_prior plans from N(mean, std), adds those of the policy prior (imagined
+    and valued once), keeps the num_elites best and refits
 
         mean = Σ_k w_k a_k        std = sqrt(Σ_k w_k (a_k - mean)²), clamped to [min_std, max_std]
 
-    The comments of configs/planner/<name>.yaml say what every number does. chunk_rows matters on a CPU only: plans imagined at a
-    time, so that intermediate results stay in cache.
+    configs/planner/<name>.yaml says what every number does. chunk_rows is for CPUs: plans imagined at a time, so that
+    intermediate results stay in cache.
 
     Raises:
         ValueError: From the constructor, if a number is out of range.
@@ -84,8 +84,8 @@ class SamplingPlanner(ABC):
             explore: Execute a sample around the mean instead of the mean.
 
         Raises:
-            FloatingPointError: If latents, policy prior, candidate values or the plan are not finite; the message says which,
-                and in which environments.
+            FloatingPointError: If latents, policy prior, candidate values or the plan are not finite; the message says
+                which, and in which environments.
             ValueError: If `previous` belongs to other sizes.
         """
         who, prior = type(self).__name__, self.num_prior
@@ -142,8 +142,8 @@ class SamplingPlanner(ABC):
             return mean
         if previous.mean.shape != mean.shape:
             raise ValueError(
-                f"The previous plan is {tuple(previous.mean.shape)}, this one {tuple(mean.shape)} (environments, horizon, "
-                "action entries): start with previous=None where one of them changes."
+                f"The previous plan is {tuple(previous.mean.shape)}, this one {tuple(mean.shape)} (environments, "
+                "horizon, action entries): start with previous=None where one of them changes."
             )
         mean[:, :-1] = previous.mean[:, 1:]
         return mean if fresh is None else mean.masked_fill_(fresh.view(-1, 1, 1), 0)

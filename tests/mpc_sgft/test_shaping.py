@@ -67,7 +67,15 @@ def test_refinement_finds_an_inner_optimum():
     def miss(refinements):
         generator = torch.Generator().manual_seed(1)
         found = improvable(
-            model, x, reward, action_dim=1, discount=1.0, generator=generator, num_prior=0, num_uniform=8, refinements=refinements
+            model,
+            x,
+            reward,
+            action_dim=1,
+            discount=1.0,
+            generator=generator,
+            num_prior=0,
+            num_uniform=8,
+            refinements=refinements,
         )
         return (found.action - 0.337).abs().mean()
 

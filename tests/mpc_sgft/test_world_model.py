@@ -38,9 +38,15 @@ def test_planner_facing_numbers_do_not_depend_on_blocks_or_gradients():
     torch.nn.init.normal_(model.reward_head[-1].weight)
     z = model.encode(torch.randn(BLOCK_ROWS + 5, 10)).detach()
     action = torch.rand(len(z), 2) * 2 - 1
-    trained = [model.next(z, action), model.reward(z, action, z), model.terminal_value(z)]
+    trained = [
+        model.next(z, action),
+        model.reward(z, action, z),
+        model.terminal_value(z),
+        model.policy_prior(z, action),
+    ]
     with torch.inference_mode():
         planned = [model.next(z, action), model.reward(z, action, z), model.terminal_value(z)]
+        planned.append(model.policy_prior(z, action))
     for a, b in zip(trained, planned, strict=True):
         assert_close(a, b, rtol=1e-5, atol=1e-5)
 
@@ -110,7 +116,12 @@ def test_dropout_only_in_critics_while_training_and_never_in_targets():
 
 @pytest.mark.parametrize(
     ("change", "message"),
-    [({"latent_dim": 20}, "simnorm_dim=8"), ({"decode_dim": 11}, "obs_dim=10"), ({"num_q": 1}, "2"), ({"reward_from": "x"}, "next")],
+    [
+        ({"latent_dim": 20}, "simnorm_dim=8"),
+        ({"decode_dim": 11}, "obs_dim=10"),
+        ({"num_q": 1}, "2"),
+        ({"reward_from": "x"}, "next"),
+    ],
 )
 def test_wrong_sizes_stop_with_the_value(change, message):
     with pytest.raises(ValueError, match=message):

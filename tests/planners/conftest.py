@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 
 class DoubleIntegrator:
-    """x' = A x + B u, cost x'Qx + u'Ru, tail -x'Px with the discounted Riccati solution; the best action is -K x. float64."""
+    """x' = A x + B u, cost x'Qx + u'Ru, tail -x'Px of the discounted Riccati equation: best action -K x. float64."""
 
     def __init__(self, discount: float, dt: float = 0.5) -> None:
         a, b = np.array([[1.0, dt], [0.0, 1.0]]), np.array([[0.5 * dt * dt], [dt]])
@@ -35,7 +35,9 @@ class DoubleIntegrator:
 class Random(nn.Module):
     """Perceptrons with random weights; V is shifted by `offset`, rewards are multiplied by `scale`."""
 
-    def __init__(self, seed: int = 0, latent: int = 6, action: int = 2, offset: float = 0.0, scale: float = 1.0) -> None:
+    def __init__(
+        self, seed: int = 0, latent: int = 6, action: int = 2, offset: float = 0.0, scale: float = 1.0
+    ) -> None:
         super().__init__()
         generator = torch.Generator().manual_seed(seed)
 

@@ -1,5 +1,6 @@
 """What every planner of configs/planner/ promises."""
 
+from dataclasses import fields
 from pathlib import Path
 
 import pytest
@@ -33,9 +34,12 @@ def z() -> Tensor:
 
 
 @pytest.mark.parametrize("name", FULL)
-def test_the_config_holds_the_numbers_of_the_class(name: str) -> None:
-    planner = instantiate(OmegaConf.load(CONFIGS / f"{name}.yaml"), action_dim=2)
-    assert planner == type(PLANNERS[name])(action_dim=2)
+def test_the_config_says_every_number_of_the_planner(name: str) -> None:
+    config = OmegaConf.load(CONFIGS / f"{name}.yaml")
+    planner = instantiate(config, action_dim=2, discount=0.9)  # the world's number and the task's
+    assert type(planner) is type(PLANNERS[name])
+    numbers = {field.name: getattr(planner, field.name) for field in fields(planner)}
+    assert {**numbers, "_target_": config._target_} == {**config, "action_dim": 2, "discount": 0.9}
 
 
 @pytest.mark.parametrize("name", FULL)
@@ -111,7 +115,9 @@ def test_what_is_not_finite_is_named(random_model, z: Tensor, name: str, part: s
 def test_the_environment_at_fault_is_named(random_model, z: Tensor, name: str) -> None:
     model, who = random_model(), type(PLANNERS[name]).__name__
     right = model.reward
-    model.reward = lambda now, action, after: right(now, action, after) + torch.where(now[..., 0] > 8, -float("inf"), 0.0)
+    model.reward = lambda now, action, after: (
+        right(now, action, after) + torch.where(now[..., 0] > 8, -float("inf"), 0.0)
+    )
     z[3, 0] = 9.0
     with pytest.raises(FloatingPointError, match=r"values.* are non-finite \(env 3\)\.$"):
         PLANNERS[name].plan(model, z, None, None, seeded())

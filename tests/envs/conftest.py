@@ -1,0 +1,90 @@
+"""Worlds to test, built from the numbers in configs/."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import yaml
+
+from envs import effects, randomize
+from envs.backends.sim import SimBackend
+from envs.env import ControlEnv
+
+CONFIGS = Path(__file__).resolve().parents[2] / "configs"
+
+
+@pytest.fixture
+def make_task() -> Callable[..., Any]:
+    """make_task(name, **changes): a task with the numbers of configs/task/<name>.yaml."""
+
+    def make(name: str, **changes: Any) -> Any:
+        numbers = yaml.safe_load((CONFIGS / f"task/{name}.yaml").read_text())["env"] | changes
+        module, kind = numbers.pop("_target_").rsplit(".", 1)
+        return getattr(importlib.import_module(module), kind)(**numbers)
+
+    return make
+
+
+@pytest.fixture
+def make_backend(make_task) -> Callable[..., SimBackend]:
+    """make_backend(task, num_envs, effects={}, draws={}, randomised=False, task_changes={}, **SimBackend's own)."""
+
+    def make(task, num_envs=1, *, effects_=None, draws=None, randomised=False, changes=None, **kwargs: Any):
+        if randomised:
+            table = yaml.safe_load((CONFIGS / f"randomize/{task}.yaml").read_text())
+            draws = table["draws"]
+            kwargs = {"noise_sd": table["noise_sd"], "noise_probability": table["noise_probability"], **kwargs}
+        return SimBackend(
+            make_task(task, **(changes or {})),
+            num_envs,
+            effects=effects.load(effects_ or {}),
+            draws=randomize.load(draws or {}),
+            **kwargs,
+        )
+
+    return make
+
+
+@pytest.fixture
+def make_env(make_backend) -> Callable[..., ControlEnv]:
+    """make_env(task, num_envs, history=0, **as make_backend): a ControlEnv."""
+
+    def make(*args: Any, history: int = 0, **kwargs: Any) -> ControlEnv:
+        return ControlEnv(make_backend(*args, **kwargs), history=history)
+
+    return make
+
+
+@pytest.fixture
+def play() -> Callable[..., dict[str, torch.Tensor]]:
+    """play(env, actions [T, N, A], seed): what a fresh episode returned, {key: [T, N, ...]}."""
+
+    def run(env: ControlEnv, actions: np.ndarray, seed: int = 0) -> dict[str, torch.Tensor]:
+        env.set_seed(seed)
+        state, rows = env.reset(), []
+        for action in actions:
+            state["action"] = torch.as_tensor(action, dtype=torch.float32)
+            state = env.step(state)["next"]
+            rows.append(dict(state.items()))
+        return {key: torch.stack([row[key] for row in rows]) for key in rows[0]}
+
+    return run
+
+
+@pytest.fixture
+def random_actions() -> Callable[..., np.ndarray]:
+    """random_actions(T, N, A, seed): uniform in [-1, 1]."""
+    return lambda *shape, seed=0: np.random.default_rng(seed).uniform(-1, 1, shape)
+
+
+@pytest.fixture
+def empty_folder(tmp_path, monkeypatch) -> Path:
+    """Work in an empty folder: MuJoCo writes its warnings to MUJOCO_LOG.TXT where it stands."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
