@@ -27,20 +27,20 @@ class ControlEnv(EnvBase):
         if history < 0:
             raise ValueError(f"history={history}; it must be 0 or more")
         n = backend.num_envs
-        super().__init__(device="cpu", batch_size=[n])
+        super().__init__(device="cpu", batch_size=torch.Size([n]))
         self.backend, self.task, self.history = backend, backend.task, history
         self.raw_dim, self.action_dim = len(self.task.observation_names), self.task.action_dim
         self.obs_dim = self.raw_dim + history * (self.raw_dim + self.action_dim)
-        flag = {"n": 1, "shape": (n, 1), "dtype": torch.bool}
+        flag = {"n": 1, "shape": torch.Size([n, 1]), "dtype": torch.bool}
         self.observation_spec = Composite(
-            observation=Unbounded((n, self.obs_dim), dtype=torch.float32),
+            observation=Unbounded(torch.Size([n, self.obs_dim]), dtype=torch.float32),
             success=Binary(**flag),
             invalid=Binary(**flag),
-            action_sent=Unbounded((n, self.action_dim), dtype=torch.float32),
+            action_sent=Unbounded(torch.Size([n, self.action_dim]), dtype=torch.float32),
             shape=(n,),
         )
-        self.action_spec = Bounded(-1.0, 1.0, (n, self.action_dim), dtype=torch.float32)
-        self.reward_spec = Unbounded((n, 1), dtype=torch.float32)
+        self.action_spec = Bounded(-1.0, 1.0, torch.Size([n, self.action_dim]), dtype=torch.float32)
+        self.reward_spec = Unbounded(torch.Size([n, 1]), dtype=torch.float32)
         self.done_spec = Composite(done=Binary(**flag), terminated=Binary(**flag), truncated=Binary(**flag), shape=(n,))
         self._clock = np.zeros(n, int)
         self._observations = np.zeros((n, history + 1, self.raw_dim))
@@ -73,7 +73,7 @@ class ControlEnv(EnvBase):
         )
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        action = tensordict["action"].detach().cpu().numpy().astype(np.float64)
+        action = np.asarray(tensordict["action"].detach().cpu(), dtype=np.float64)
         bad = np.flatnonzero(~np.isfinite(action).all(1))
         if len(bad):
             raise FloatingPointError(f"action is not finite in environment {bad[0]}: {action[bad[0]]}")

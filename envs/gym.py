@@ -9,7 +9,7 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict
 
 from envs.backends.sim import SimBackend
 from envs.camera import Camera
@@ -48,9 +48,9 @@ class GymEnv(gymnasium.Env):
 
     def step(self, action: Floats) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
         out = _step(self.env, np.asarray(action)[None])
-        flags = {key: bool(out[key]) for key in ("terminated", "truncated", "success", "invalid")}
-        info = {key: flags[key] for key in ("success", "invalid")}
-        return out["observation"][0].numpy(), float(out["reward"]), flags["terminated"], flags["truncated"], info
+        info = {key: bool(out[key][0, 0]) for key in ("success", "invalid")}
+        terminated, truncated = (bool(out[key][0, 0]) for key in ("terminated", "truncated"))
+        return out["observation"][0], float(out["reward"][0, 0]), terminated, truncated, info
 
     def render(self) -> NDArray[np.uint8] | None:
         return self._camera.picture(0) if self._camera else None
@@ -106,8 +106,8 @@ class GymVectorEnv(gymnasium.vector.VectorEnv):
 
     def step(self, actions: Floats) -> tuple[Floats, NDArray[np.float64], Flags, Flags, dict[str, Any]]:
         out = _step(self.env, np.asarray(actions))
-        observation, reward = out["observation"].numpy(), out["reward"][:, 0].double().numpy()
-        flags = {key: out[key][:, 0].numpy().copy() for key in ("terminated", "truncated", "success", "invalid")}
+        observation, reward = out["observation"], out["reward"][:, 0].astype(np.float64)
+        flags = {key: out[key][:, 0].copy() for key in ("terminated", "truncated", "success", "invalid")}
         infos: dict[str, Any] = {}
         begins = self._ended
         if self.autoreset_mode is AutoresetMode.NEXT_STEP:
@@ -116,7 +116,7 @@ class GymVectorEnv(gymnasium.vector.VectorEnv):
             self._ended = flags["terminated"] | flags["truncated"]
         else:
             begins = flags["terminated"] | flags["truncated"]
-            for i in np.flatnonzero(begins):
+            for i in np.flatnonzero(begins).tolist():
                 final = {key: bool(flags[key][i]) for key in ("success", "invalid")}
                 infos = self._add_info(infos, {"final_obs": observation[i].copy(), "final_info": final}, i)
         flags["success"][begins] = flags["invalid"][begins] = False  # these are of the new episode
@@ -148,6 +148,8 @@ def _spaces(env: ControlEnv) -> tuple[spaces.Box, spaces.Box]:
     return spaces.Box(-np.inf, np.inf, (env.obs_dim,), np.float32), spaces.Box(-1.0, 1.0, (env.action_dim,), np.float32)
 
 
-def _step(env: ControlEnv, actions: Floats) -> TensorDictBase:
+def _step(env: ControlEnv, actions: Floats) -> dict[str, NDArray[Any]]:
+    """What a step brought, {key: [N, ...]}."""
     action = torch.from_numpy(actions.astype(np.float32))
-    return env.step(TensorDict({"action": action}, [len(actions)]))["next"]
+    out = env.step(TensorDict({"action": action}, [len(actions)]))["next"]
+    return {str(key): value.numpy() for key, value in out.items()}

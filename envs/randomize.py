@@ -55,7 +55,8 @@ def load(draws: Mapping[str, Mapping[str, Any]]) -> list[Draw]:
     built = []
     for name, entries in draws.items():
         try:
-            built.append(Draw(**{k: tuple(v) if isinstance(v, list) else v for k, v in entries.items()}))
+            known: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in entries.items()}
+            built.append(Draw(**known))
         except TypeError as error:
             raise ValueError(
                 f"randomize draw {name!r}: {error}. It has: {', '.join(f.name for f in fields(Draw))}."

@@ -1,5 +1,6 @@
 """The line between what is above (learning) and what is below (physics, or a robot)."""
 
+from collections import Counter
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -20,26 +21,39 @@ class Outcome(NamedTuple):
 
 
 class Backend(Protocol):
-    """Resets, and carries out actions. Everything above sees observations and rewards, nothing else."""
+    """Resets, and carries out actions. Everything above sees observations and rewards, nothing else.
+
+    Attributes:
+        task: What is done.
+        num_envs: N.
+        counters: How often what went wrong since the beginning; `unstable` counts failed physics.
+    """
 
     task: AbstractTask
     num_envs: int
+    counters: Counter[str]
 
     def seed(self, seed: int) -> None:
         """Make everything random from here on a function of `seed`."""
+        ...
 
     def reset(self, sims: NDArray[np.int_]) -> Array:
         """Start new episodes in some environments; their first observations, [n, O]."""
+        ...
 
     def send(self, action: Array) -> Outcome:
         """Carry out one control period in every environment."""
+        ...
 
     def positions(self) -> Array | None:
         """Joint positions of the first environment now, [nq]; None if there are none to show."""
+        ...
 
     def samples(self) -> dict[str, Array] | None:
         """Joint-level record of the first environment's last period at 100 Hz or more: time [S] since the episode's
         start, qpos [S, nq], qvel [S, nv], ctrl [S, nu], force [S, nu]; None if there is none."""
+        ...
 
     def describe(self) -> dict[str, object]:
         """Names of joints and actuators, for recordings; nothing of what is hidden."""
+        ...

@@ -72,7 +72,7 @@ class SimBackend:
         self.noisy, self.unstable = np.zeros(num_envs, bool), np.zeros(num_envs, bool)
         self.remembers = any(type(e).sense is not Effect.sense for e in self.effects)
         self.past: list[tuple[Array, Array]] = []
-        self._last: dict[str, Array] = {}
+        self._last: dict[str, NDArray[np.floating]] = {}
         self.seed(0)
         for effect in self.effects:  # a parameter that does not fit the task stops here, not in the first episode
             effect.command(np.zeros((1, task.action_dim)), task)

@@ -161,7 +161,7 @@ class Push(AbstractTask):
     def fell(self, observation: Array) -> NDArray[np.bool_]:
         """Whether the puck's centre is beyond the table's edge, [N]."""
         puck = observation[:, 2:]
-        return ((puck < TABLE_LOW) | (puck > TABLE_HIGH)).any(1)
+        return np.any((puck < TABLE_LOW) | (puck > TABLE_HIGH), axis=1)
 
     def success(self, observation: Array) -> NDArray[np.bool_]:
         return (np.abs(observation[:, 2] - self.goal_x) < self.tolerance) & ~self.fell(observation)

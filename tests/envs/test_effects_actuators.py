@@ -95,9 +95,10 @@ def test_zero_delay_equals_no_delay(make_backend) -> None:
         np.testing.assert_allclose(other["force"], none["force"], atol=1e-12)
 
 
-def test_the_command_history_starts_filled_with_the_first_command(make_backend) -> None:
-    """MuJoCo's starts at zero, which would throw the arm towards its zero posture."""
-    backend = make_backend("push", 2, effects_={"actuator_delay": {"delay": 0.5}})
+@pytest.mark.parametrize("gap", [{"actuator_delay": {"delay": 0.5}}, {"actuator_lag": {"time_constant": 0.5}}])
+def test_history_and_filter_start_filled_with_the_first_command(make_backend, gap) -> None:
+    """MuJoCo's start at zero, which would throw the arm towards its zero posture."""
+    backend = make_backend("push", 2, effects_=gap)
     backend.reset(np.arange(2))
     start = backend.qpos[:, :7].copy()
     moved = _run(backend, [[0.0, 0.0]] * 4)["qpos"][:, :, :7]
