@@ -33,8 +33,9 @@ def batch(env: ControlEnv, seed: int) -> tuple[int, float, float]:
         state["action"] = torch.cat([fresh[: N // 2], held[N // 2 :]])
         state = env.step(state)["next"]
         fine = ~state["invalid"][:, 0]
-        far = max(far, float(state["observation"][fine].abs().max()))
-        fast = max(fast, float(abs(env.backend.qvel[fine.numpy()]).max()))
+        if fine.any():
+            far = max(far, float(state["observation"][fine].abs().max()))
+            fast = max(fast, float(abs(env.backend.qvel[fine.numpy()]).max()))
     return env.backend.counters["unstable"] - before, far, fast
 
 

@@ -72,7 +72,7 @@ class SimBackend:
         self.noisy, self.unstable = np.zeros(num_envs, bool), np.zeros(num_envs, bool)
         self.remembers = any(type(e).sense is not Effect.sense for e in self.effects)
         self.past: list[tuple[Array, Array]] = []
-        self._last: dict[str, NDArray[np.floating]] = {}
+        self._last: dict[str, Array] = {}
         self.seed(0)
         for effect in self.effects:  # a parameter that does not fit the task stops here, not in the first episode
             effect.command(np.zeros((1, task.action_dim)), task)
@@ -117,7 +117,8 @@ class SimBackend:
         ctrl = before[:, None] + ramp * (self.task.ctrl(self.target, before) - before)[:, None]  # [N, S, nu]
         start = float(self.clock[0])
         moved = self._advance(ctrl)
-        self._last = {"time": start + self.task.sim_dt * np.arange(1, self.steps + 1), "ctrl": ctrl, **moved}
+        time = start + np.linspace(self.task.sim_dt, self.task.control_dt, self.steps)
+        self._last = {"time": time, "ctrl": ctrl, **moved}
         if self.remembers:
             self.past.insert(0, (moved["qpos"].copy(), moved["qvel"].copy()))
             del self.past[int(MAX_PAST / self.task.control_dt) + 1 :]

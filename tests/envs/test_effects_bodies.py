@@ -65,11 +65,11 @@ def test_viscous_friction_decays_exponentially() -> None:
 
 def test_coulomb_friction_slows_evenly_and_then_holds() -> None:
     t, v = _speeds({"coulomb_friction": {"torque": 1.2, "at": ["slide"]}}, 3.0)
-    np.testing.assert_allclose(v[:, 0], np.maximum(1 - 1.2 / 2 * t, 0), atol=0.01)
+    np.testing.assert_allclose(v[:, 0], np.maximum(1 - 1.2 / 2 * t, 0), atol=2e-4)
     assert np.abs(v[-500:, 0]).max() < 1e-3
     np.testing.assert_allclose(v[:, 1], 2.0)  # not named
     t, v = _speeds({"coulomb_friction": {"torque": 0.03, "at": ["hinge"]}}, 3.0)
-    np.testing.assert_allclose(v[:, 1], np.maximum(2 - 0.03 / 0.06 * t, 0), atol=0.02)
+    np.testing.assert_allclose(v[:, 1], np.maximum(2 - 0.03 / 0.06 * t, 0), atol=2e-3)
 
 
 @pytest.mark.parametrize("force", [1.0, 1.4])
@@ -78,7 +78,7 @@ def test_coulomb_friction_sticks_below_its_threshold(force) -> None:
     data.ctrl[0] = force
     mujoco.mj_step(model, data, nstep=1000)
     expected = max(force - 1.2, 0.0) / 2
-    assert data.qvel[0] == pytest.approx(expected, abs=0.003)
+    assert data.qvel[0] == pytest.approx(expected, abs=1e-5)  # MuJoCo's default friction creeps at 5e-4 here
 
 
 @pytest.mark.parametrize("gap", [{"viscous_friction": {"coefficient": 5.0}}, {"coulomb_friction": {"torque": 5.0}}])

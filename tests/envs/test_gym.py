@@ -138,7 +138,6 @@ def test_what_the_adapters_refuse(make_env) -> None:
 
 PICTURE = """
 import numpy as np
-from gymnasium.utils.env_checker import check_env
 from envs.backends.sim import SimBackend
 from envs.env import ControlEnv
 from envs.gym import GymEnv, GymVectorEnv
@@ -149,7 +148,6 @@ def make(n):
     return ControlEnv(SimBackend(task, n))
 
 env = GymEnv(make(1), render_mode="rgb_array")
-check_env(env)
 env.reset(seed=0)
 before = env.render()
 for _ in range(8):
