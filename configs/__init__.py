@@ -1,1 +1,1 @@
-"""Numbers and the only Hydra syntax: one folder per choice, one yaml per option. A package, so that the wheel carries it."""
+"""Numbers and the only Hydra syntax: a folder per choice, a yaml per option. A package, so that the wheel has it."""

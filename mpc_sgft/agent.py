@@ -72,6 +72,8 @@ class Agent:
         transfer_entropy_coef: float,
         anchor: float,
         residual: bool,
+        command_map: bool,
+        command_lr: float,
     ) -> None:
         if not 0 <= discount <= 1 or not 0 < rho <= 1:
             raise ValueError(f"discount must lie in [0, 1] and rho in (0, 1], got discount={discount}, rho={rho}.")
@@ -88,6 +90,7 @@ class Agent:
         }
         self.transfer_lr, self.transfer_policy_lr = transfer_lr, transfer_policy_lr
         self.transfer_entropy_coef, self.anchor, self.residual = transfer_entropy_coef, anchor, residual
+        self.command_map, self.command_lr = command_map, command_lr
         self.generator = torch.Generator(self.device).manual_seed(seed)
         self.scale = losses.RunningScale(scale_rate, self.device)
         self.log_entropy_coef = torch.tensor(entropy_coef, device=self.device).log().requires_grad_()
@@ -131,6 +134,12 @@ class Agent:
             raise FloatingPointError(f"observation is not finite, first at [environment, entry] = {bad}.")
         z = self.model.encode(observation)
         return planner.plan(self.model, z, previous, fresh, generator, keep_candidates=keep_candidates, explore=explore)
+
+    def scale_learning_rates(self, share: float) -> None:
+        """Set the pretraining learning rates to a share of the configured ones."""
+        for optimizer in (self.model_optimizer, self.policy_optimizer):
+            for group in optimizer.param_groups:
+                group["lr"] = share * group.setdefault("full_lr", group["lr"])
 
     # -- learning in simulation ----------------------------------------------------------------------------------------
 
@@ -207,7 +216,13 @@ class Agent:
     # -- learning on real data -----------------------------------------------------------------------------------------
 
     def freeze_for_transfer(
-        self, method: str, *, horizon: int = 4, anchor: float | None = None, residual: bool | None = None
+        self,
+        method: str,
+        *,
+        horizon: int = 4,
+        anchor: float | None = None,
+        residual: bool | None = None,
+        command_map: bool | None = None,
     ) -> None:
         """Freeze everything but what `method` trains, and start fresh optimisers.
 
@@ -217,6 +232,8 @@ class Agent:
             anchor: Weight of the squared distance of the dynamics' parameters from the pretrained ones beside their
                 consistency loss; None: as configured.
             residual: Train a correction on top of frozen pretrained dynamics; None: as configured.
+            command_map: Also learn what the machine makes of a command, a few numbers that hold everywhere; None: as
+                configured.
 
         Raises:
             ValueError: If the method is unknown or the horizon is not positive.
@@ -228,6 +245,7 @@ class Agent:
         self.method, self.horizon = method, horizon
         self.anchor = self.anchor if anchor is None else anchor
         self.residual = self.residual if residual is None else residual
+        self.command_map = self.command_map if command_map is None else command_map
         self.trainable = (*METHODS[method], "target_q") if method == "tdmpc2" else METHODS[method]
         model = self.model
         model.requires_grad_(False)
@@ -238,7 +256,12 @@ class Agent:
                 model.add_residual()
             model.dynamics.base.requires_grad_(False)
             self.trainable = ("dynamics.residual", "policy_head")
-        self._anchored = [p.detach().clone() for p in model.dynamics.parameters() if p.requires_grad]
+        if self.command_map and method == "sgft":
+            if model.dynamics.command is None:
+                model.add_command_map()
+            self.trainable += ("dynamics.command",)
+        trained = [p for part in (model.dynamics.base, model.dynamics.residual) if part for p in part.parameters()]
+        self._anchored = [p.detach().clone() for p in trained if p.requires_grad]
         if method == "tdmpc2":
             self._make_optimizers(self.lr, self.lr)
         elif method == "sgft":
@@ -268,7 +291,7 @@ class Agent:
         loss = losses.over_time(losses.consistency_loss(zs[1:], encoded[1:]), self.rho, weight)
         metrics = {"consistency_loss": loss}
         if self.anchor:
-            moved = zip(self._model_parameters, self._anchored, strict=True)
+            moved = zip(self._model_parameters[-len(self._anchored) :], self._anchored, strict=True)
             metrics["anchor_distance"] = torch.stack([(now - then).square().sum() for now, then in moved]).sum()
             loss = loss + self.anchor * metrics["anchor_distance"]
         check_finite(metrics)
@@ -322,7 +345,8 @@ class Agent:
 
     def state_dict(self) -> dict[str, Any]:
         """Everything needed to go on with the same numbers; the torch global generator (dropout) is included."""
-        transfer = {"method": self.method, "horizon": self.horizon, "anchor": self.anchor, "residual": self.residual}
+        names = ("method", "horizon", "anchor", "residual", "command_map")
+        transfer = {name: getattr(self, name) for name in names}
         return {
             "transfer": transfer,
             "anchored": [x.clone() for x in self._anchored],
@@ -346,9 +370,11 @@ class Agent:
 
     def _make_optimizers(self, lr: float, policy_lr: float) -> None:
         model = self.model
-        groups = []
+        command = [] if model.dynamics.command is None else [*model.dynamics.command.parameters()]
+        groups = [{"params": command, "lr": self.command_lr}] if command else []
         for part in PRETRAINED:
             parameters = [p for p in getattr(model, part).parameters() if p.requires_grad and part != "policy_head"]
+            parameters = [p for p in parameters if all(p is not c for c in command)]
             if parameters:
                 share = self.encoder_lr_share if part == "encoder" else 1.0
                 groups.append({"params": parameters, "lr": lr * share})

@@ -70,7 +70,7 @@ def make_agent(cfg: DictConfig, env: ControlEnv) -> Agent:
     torch.manual_seed(cfg.seed)
     with from_config("model"):
         sizes = {"obs_dim": env.obs_dim, "action_dim": env.action_dim, "decode_dim": env.raw_dim}
-        model = instantiate(cfg.model, **sizes)
+        model = instantiate(cfg.model, memory_dim=env.history * env.action_dim, **sizes)
     with from_config("train"):
         return instantiate(cfg.train.agent, model=model, seed=cfg.seed, device=device(cfg), discount=cfg.task.discount)
 

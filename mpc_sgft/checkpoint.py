@@ -46,6 +46,7 @@ def describe(cfg: DictConfig, model: WorldModel, extra: Mapping[str, Any] | None
         "discount": float(cfg.task.discount),
         "sizes": dict(model.sizes),
         "residual": model.dynamics.residual is not None,
+        "command_map": model.dynamics.command is not None,
         "config": OmegaConf.to_container(cfg, resolve=True),
         **(extra or {}),
     }
@@ -108,6 +109,8 @@ def load(
         model = WorldModel(**meta["sizes"])
         if meta.get("residual"):
             model.add_residual()
+        if meta.get("command_map"):
+            model.add_command_map()
         model.load_state_dict(tensors)
     except (TypeError, ValueError, RuntimeError) as err:
         raise CheckpointError(f"{file} does not fit the sizes in its own header ({err}). {_AGAIN}") from err

@@ -2,10 +2,8 @@
 
 import json
 import time
-from pathlib import Path
 from typing import Any
 
-import torch
 from omegaconf import DictConfig
 
 from envs.env import ControlEnv
@@ -28,7 +26,9 @@ REAL_SEED = 2_000_000  # real rollouts never share a seed with evaluation or pre
 def deploy(cfg: DictConfig) -> int:
     """Adapt a pretrained agent with real rollouts; returns the exit code."""
     if cfg.backend.name == "franka":
-        raise UserError("--backend franka is not in this version. Rehearse with --backend sim and a gap, e.g. gap=turned.")
+        raise UserError(
+            "--backend franka is not in this version. Rehearse with --backend sim and a gap, e.g. gap=turned."
+        )
     agent, _ = build.load_agent(cfg)
     env = build.make_env(cfg, 1)
     judge = build.make_env(cfg, cfg.eval_episodes)
@@ -47,7 +47,8 @@ class Deployment:
         build.prepare_process(cfg)
         self.planner = build.make_planner(cfg, env.action_dim)
         t = cfg.transfer
-        agent.freeze_for_transfer(cfg.method, horizon=cfg.planner.horizon, anchor=t.anchor, residual=t.residual)
+        remedies = {"anchor": t.anchor, "residual": t.residual, "command_map": t.command_map}
+        agent.freeze_for_transfer(cfg.method, horizon=cfg.planner.horizon, **remedies)
         self.frozen = agent.frozen_hash()
         self.transfer = Transfer(
             agent,
@@ -70,7 +71,9 @@ class Deployment:
             wandb=cfg.log.wandb,
             resume_step=self.state["rollouts"] if cfg.resume is not None else None,
         )
-        self.viewer = DeployViewer(self.folder / "run.rrd", env, resume=cfg.resume is not None) if cfg.log.rerun else None
+        self.viewer = (
+            DeployViewer(self.folder / "run.rrd", env, resume=cfg.resume is not None) if cfg.log.rerun else None
+        )
         self.began = time.monotonic() - self.state["seconds"]
 
     def loop(self) -> int:
@@ -81,7 +84,9 @@ class Deployment:
             self._save()
         if self.viewer:
             self.viewer.value_map("before", self.transfer.acting)
-        bar = progress(cfg.rollouts, initial=self.state["rollouts"], desc=f"deploy {cfg.method}", unit="rollout", disable=cfg.quiet)
+        bar = progress(
+            cfg.rollouts, initial=self.state["rollouts"], desc=f"deploy {cfg.method}", unit="rollout", disable=cfg.quiet
+        )
         while self.state["rollouts"] < cfg.rollouts:
             number = self.state["rollouts"] + 1
             rollout = self._rollout(number)
@@ -111,7 +116,9 @@ class Deployment:
             path.rename(path.with_suffix(".empty.mcap"))  # the robot never moved
         planner = self.planner
         if number <= cfg.warmup:
-            planner = PolicyPlanner(action_dim=self.env.action_dim, horizon=cfg.planner.horizon, discount=cfg.task.discount)
+            planner = PolicyPlanner(
+                action_dim=self.env.action_dim, horizon=cfg.planner.horizon, discount=cfg.task.discount
+            )
         model = self.transfer.pretrained if number <= cfg.warmup else self.transfer.acting
         return drive(
             self.env,

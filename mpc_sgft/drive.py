@@ -2,7 +2,7 @@
 
 import time
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import torch
@@ -68,7 +68,7 @@ def drive(
     state, plan = env.reset(), None
     first = env.backend.positions()
     rows, plans, values, plan_ms, candidates = [], [], [], [], []
-    qpos = [] if first is None else [first]
+    qpos: list[Any] = [] if first is None else [first]
     aborted, meta = None, {"task": task.name, "seed": seed, "control_dt": task.control_dt, **env.backend.describe()}
     with EpisodeWriter(path, meta) as writer:
         for t in range(task.episode_steps):
@@ -91,7 +91,7 @@ def drive(
                 aborted = "physics unstable"
             if row["next", "done"].item():
                 break
-        steps = torch.stack(rows)
+        steps = cast(TensorDict, TensorDict.stack(rows))
         success = bool(steps["next", "success"][-1])
         writer.close({"success": success, "return": float(steps["next", "reward"].sum()), "aborted": aborted})
     return Rollout(
@@ -164,7 +164,7 @@ def _step(env: ControlEnv, state: TensorDict, number: int, t: int) -> tuple[Tens
 
 def _transition(row: TensorDict, t: int, control_dt: float) -> dict[str, Any]:
     """One control step as the recording wants it."""
-    following = row["next"]
+    following = row.get("next")
     flat = {key: following[key][0, 0].item() for key in ("reward", "terminated", "truncated", "success", "invalid")}
     return {
         "step": t,

@@ -1,9 +1,10 @@
 """Success of a checkpoint, or of a simple policy, on any task and gap."""
 
 import json
+from typing import cast
 
-import torch
 from omegaconf import DictConfig
+from tensordict import TensorDict
 
 from mpc_sgft import build, run_folder
 from mpc_sgft.errors import UserError, from_config
@@ -15,17 +16,18 @@ CHUNK = 100  # episodes side by side
 
 def evaluate(cfg: DictConfig) -> int:
     """Run the episodes, print and save the result as JSON; returns the exit code."""
-    env = build.make_env(cfg, min(cfg.episodes, CHUNK))
+    env = build.make_env(cfg, min(cfg.episodes, CHUNK), randomised=True)
     if cfg.episodes % env.batch_size[0]:
         raise UserError(f"episodes={cfg.episodes}: more than {CHUNK} must be a multiple of {CHUNK}.")
     act = _policy(cfg, env)
     folder = run_folder.start(cfg)
     build.prepare_process(cfg)
     parts = [collect(env, act, seed=EVAL_SEED + cfg.seed + i) for i in range(cfg.episodes // env.batch_size[0])]
-    result = score(torch.cat(parts))
+    result = score(cast(TensorDict, TensorDict.cat(parts)))
     summary = {
         "task": cfg.chosen.task,
         "gap": cfg.chosen.gap,
+        "randomize": cfg.chosen.randomize,
         "policy": cfg.policy,
         "planner": cfg.chosen.planner if cfg.policy == "planner" else None,
         "seed": cfg.seed,

@@ -3,13 +3,11 @@
 import json
 import signal
 import time
-from pathlib import Path
 from types import FrameType
 
 import torch
 from hydra.utils import instantiate
 from omegaconf import DictConfig
-from tensordict import TensorDict
 from torch import Tensor
 
 from mpc_sgft import build, checkpoint, run_folder
@@ -44,12 +42,16 @@ def pretrain(cfg: DictConfig) -> int:
         """Weights and exact state, at the end of a round."""
         meta = checkpoint.describe(cfg, agent.model, extra={"transitions": state["transitions"]})
         checkpoint.save(folder / "checkpoint" / "model.safetensors", agent.model, meta)
-        checkpoint.save_state(
-            saved, {"loop": state, "agent": agent.state_dict(), "buffer": buffer.state_dict()}
-        )
+        checkpoint.save_state(saved, {"loop": state, "agent": agent.state_dict(), "buffer": buffer.state_dict()})
 
     stop = StopRequest("round")
-    logger = MetricLogger(folder, csv=cfg.log.csv, tensorboard=cfg.log.tensorboard, wandb=cfg.log.wandb, resume_step=state["transitions"] if cfg.resume is not None else None)
+    logger = MetricLogger(
+        folder,
+        csv=cfg.log.csv,
+        tensorboard=cfg.log.tensorboard,
+        wandb=cfg.log.wandb,
+        resume_step=state["transitions"] if cfg.resume is not None else None,
+    )
     bar = progress(cfg.transitions, initial=state["transitions"], desc="pretrain", disable=cfg.quiet)
     result, began = None, time.monotonic() - state["seconds"]
     while state["transitions"] < cfg.transitions:
@@ -60,6 +62,7 @@ def pretrain(cfg: DictConfig) -> int:
         state["transitions"] += data.numel()
         state["episodes"] = int(data["episode"].max()) + 1
         metrics: dict[str, float] = {"train_success": score(data).success}
+        agent.scale_learning_rates(0.5 ** (state["transitions"] / cfg.lr_halves_every))
         owed = int(state["transitions"] * cfg.updates_per_transition) - state["updates"]
         for _ in range(owed):
             metrics |= agent.update(buffer.sample())
@@ -78,7 +81,9 @@ def pretrain(cfg: DictConfig) -> int:
         if stop.asked or done or state["round"] % cfg.save_every == 0:
             save()
         if stop.asked:
-            raise Stopped(f"saved after {state['transitions']} transitions. Go on: python -m mpc_sgft.pretrain --resume {folder}")
+            raise Stopped(
+                f"saved after {state['transitions']} transitions. Go on: python -m mpc_sgft.pretrain --resume {folder}"
+            )
         if done:
             break
     save()
@@ -86,17 +91,17 @@ def pretrain(cfg: DictConfig) -> int:
     final_judge = build.make_env(cfg, cfg.final_episodes, randomised=True)
     final = score(collect(final_judge, prior(agent), seed=EVAL_SEED + 1))
     planner = build.make_planner(cfg, env.action_dim)
-    planned = score(collect(judge, planner_policy(agent.model, planner, cfg.seed), seed=EVAL_SEED + 1))
+    planned = score(collect(final_judge, planner_policy(agent.model, planner, cfg.seed), seed=EVAL_SEED + 1))
     summary = {
         "task": cfg.chosen.task,
         "seed": cfg.seed,
         "transitions": state["transitions"],
         "updates": state["updates"],
         "episodes_evaluated": final.episodes,
-        "success": final.success,
-        "success_interval": [final.success_low, final.success_high],
-        "planner_success": planned.success,
-        "return": final.episode_return,
+        "success": planned.success,
+        "success_interval": [planned.success_low, planned.success_high],
+        "prior_success": final.success,
+        "return": planned.episode_return,
         "unstable_episodes": env.backend.counters["unstable"],
         "wall_seconds": round(time.monotonic() - began, 1),
         "checkpoint": str(folder / "checkpoint" / "model.safetensors"),
@@ -110,7 +115,12 @@ def pretrain(cfg: DictConfig) -> int:
 def explorer(agent: Agent, cfg: DictConfig, round_number: int) -> Act:
     """The policy with its own noise; in a share of the environments more noise, so that the model sees mistakes."""
     generator = torch.Generator().manual_seed(_seed(cfg.seed, round_number))
-    sample = planner_policy(agent.model, PolicyPlanner(action_dim=agent.model.action_dim, horizon=1), _seed(cfg.seed, round_number), explore=True)
+    sample = planner_policy(
+        agent.model,
+        PolicyPlanner(action_dim=agent.model.action_dim, horizon=1),
+        _seed(cfg.seed, round_number),
+        explore=True,
+    )
 
     def act(observation: Tensor, fresh: Tensor) -> Tensor:
         action = sample(observation, fresh)

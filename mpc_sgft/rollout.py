@@ -1,7 +1,7 @@
 """Whole episodes, all environments in step: for collecting, and for measuring success."""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 import torch
@@ -53,7 +53,7 @@ def collect(env: ControlEnv, act: Act, *, seed: int, first_episode: int = 0) -> 
         episode, step = episode.clone(), torch.where(fresh, 0, step + 1)
         episode[fresh] = following + torch.arange(int(fresh.sum()))
         following += int(fresh.sum())
-    return torch.stack(rows, 1)
+    return cast(TensorDict, TensorDict.stack(rows, 1))
 
 
 def score(episodes: TensorDict) -> Score:
@@ -79,6 +79,7 @@ def planner_policy(model: WorldModel, planner, seed: int, *, explore: bool = Fal
         with torch.inference_mode():
             z = model.encode(observation.to(device))
             previous = planner.plan(model, z, previous, fresh.to(device), generator, explore=explore)
+        assert previous is not None
         return previous.action.cpu().clone()  # an ordinary tensor, not one of inference mode
 
     return act

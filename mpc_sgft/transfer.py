@@ -1,9 +1,10 @@
 """Learning from few real rollouts without losing what the simulator taught.
 
-The dynamics and the policy that act are not simply the ones that train. A model fine-tuned on the two hundred
+The dynamics and the policy that act are not simply the ones that train. A model fine-tuned on two hundred
 transitions of five rollouts has forgotten what it knew elsewhere, and where zero-shot already worked that does harm. So
 each new rollout is first a test: it has not been trained on, and the pretrained and the fine-tuned dynamics both
-predict it. The fine-tuned parts act once they have predicted such rollouts clearly better; until then the pretrained do.
+predict it. The fine-tuned parts act once they have predicted such rollouts clearly better; until then the pretrained
+do.
 """
 
 import copy
@@ -34,7 +35,7 @@ class Transfer:
         slice_len, batch_size, seed: Of the replay slices.
         updates: Gradient steps after each rollout.
         gate: Whether fine-tuned parts must first predict unseen rollouts better; without, they act at once.
-        margin: They must lower the error to this share of the pretrained error, on the mean of the last `memory` rollouts.
+        margin: They must lower the error to this share of the pretrained error, over the last `memory` rollouts.
         memory: Rollouts that the gate looks back on.
     """
 
@@ -53,18 +54,22 @@ class Transfer:
     ):
         self.agent, self.updates, self.gate, self.margin, self.memory = agent, updates, gate, margin, memory
         self.slice_len = slice_len
-        self.buffer = make_buffer(capacity, slice_len, batch_size, seed)
+        self.buffer = make_buffer(capacity=capacity, slice_len=slice_len, batch_size=batch_size, seed=seed)
         self.pretrained = copy.deepcopy(agent.model)
         self.acting: WorldModel = copy.deepcopy(agent.model)
         self.verdicts: list[Verdict] = []
 
     def judge(self, steps: TensorDict) -> Verdict:
         """Test both dynamics on a rollout [T] before it is learned from, and decide who acts next."""
-        errors = [float(open_loop_error(m, steps, self.slice_len).nanmean()) for m in (self.pretrained, self.agent.model)]
-        recent = [*self.verdicts, Verdict(*errors, False)][1:][-self.memory :]  # before the first rollout nothing differs
-        before, after = sum(v.pretrained for v in recent), sum(v.fine_tuned for v in recent)
-        accepted = not self.gate or (bool(recent) and after < self.margin * before)
-        self.verdicts.append(Verdict(*errors, accepted))
+        pretrained, fine_tuned = (
+            float(open_loop_error(model, steps, self.slice_len).nanmean())
+            for model in (self.pretrained, self.agent.model)
+        )
+        self.verdicts.append(Verdict(pretrained, fine_tuned, not self.gate))
+        recent = self.verdicts[1:][-self.memory :]  # at the first rollout the two are still the same
+        if self.gate and recent:
+            lower = sum(v.fine_tuned for v in recent) < self.margin * sum(v.pretrained for v in recent)
+            self.verdicts[-1] = self.verdicts[-1]._replace(accepted=lower)
         return self.verdicts[-1]
 
     def learn(self, steps: TensorDict) -> dict[str, float]:

@@ -30,18 +30,31 @@ LOG_STD_MIN, LOG_STD_MAX = -10.0, 2.0
 
 
 class Dynamics(nn.Module):
-    """Latent dynamics z' = SimNorm(f(z, a) [+ residual(z, a)]); the residual is absent until `add_residual`."""
+    """Latent dynamics. A latent z = [s, m] is a code s [D] and the last commands m, newest first [M].
 
-    def __init__(self, latent_dim: int, action_dim: int, mlp_dim: int, simnorm_dim: int) -> None:
+        c  = command(a, m)                              what the machine makes of its commands, here simply a
+        s' = SimNorm(f(s, m, c) [+ residual(s, m, c)])
+        m' = [a, m without its last command]            exact, so only s' is learned
+
+    At transfer `add_command_map` makes c an affine function of a and m, a gain, a rotation, a drift, a delay or a lag,
+    which starts as the identity; `add_residual` adds a correction that starts at zero.
+    """
+
+    def __init__(self, code_dim: int, memory_dim: int, action_dim: int, mlp_dim: int, simnorm_dim: int) -> None:
         super().__init__()
-        self.base = mlp([latent_dim + action_dim, mlp_dim, mlp_dim, latent_dim], out=nn.Identity())  # ends in LayerNorm
+        inputs = code_dim + memory_dim + action_dim
+        self.base = mlp([inputs, mlp_dim, mlp_dim, code_dim], out=nn.Identity())  # ends in LayerNorm
         self.residual: nn.Module | None = None
-        self.simnorm_dim = simnorm_dim
+        self.command: nn.Linear | None = None
+        self.code_dim, self.memory_dim, self.simnorm_dim = code_dim, memory_dim, simnorm_dim
 
     def forward(self, z: Tensor, action: Tensor) -> Tensor:
-        x = torch.cat([z, action], -1)  # [..., D + A]
+        commands = torch.cat([action, z[..., self.code_dim :]], -1)  # newest first [..., A + M]
+        realised = action if self.command is None else self.command(commands)
+        x = torch.cat([z, realised], -1)  # [..., D + M + A]
         logits = self.base(x)
-        return simnorm(logits if self.residual is None else logits + self.residual(x), self.simnorm_dim)
+        code = simnorm(logits if self.residual is None else logits + self.residual(x), self.simnorm_dim)
+        return torch.cat([code, commands[..., : self.memory_dim]], -1) if self.memory_dim else code
 
 
 class WorldModel(nn.Module):
@@ -51,7 +64,9 @@ class WorldModel(nn.Module):
         obs_dim: Entries of an observation, history included [O].
         action_dim: Entries of an action [A].
         decode_dim: Leading observation entries that `decode` returns (the raw observation without history).
-        latent_dim: Entries of the latent [D], a multiple of simnorm_dim.
+        latent_dim: Entries of the code that the encoder makes, a multiple of simnorm_dim.
+        memory_dim: Last entries of the observation, past actions newest first, that the latent carries as they are. A
+            latent then has D = latent_dim + memory_dim entries, and the dynamics need not learn to remember.
         mlp_dim, enc_dim: Hidden sizes of the heads and of the encoder.
         enc_layers: Hidden layers of the encoder.
         num_q: Members of the critic ensemble [E].
@@ -73,6 +88,7 @@ class WorldModel(nn.Module):
         action_dim: int,
         decode_dim: int,
         latent_dim: int,
+        memory_dim: int = 0,
         mlp_dim: int,
         enc_dim: int,
         enc_layers: int = 2,
@@ -88,6 +104,10 @@ class WorldModel(nn.Module):
         super().__init__()
         if latent_dim % simnorm_dim:
             raise ValueError(f"latent_dim={latent_dim} is not a multiple of simnorm_dim={simnorm_dim}.")
+        if memory_dim % action_dim or not 0 <= memory_dim < obs_dim:
+            raise ValueError(
+                f"memory_dim={memory_dim} must be whole actions (action_dim={action_dim}) of the observation."
+            )
         if not 1 <= decode_dim <= obs_dim:
             raise ValueError(f"decode_dim={decode_dim} must lie between 1 and obs_dim={obs_dim}.")
         if num_q < 2:
@@ -95,14 +115,16 @@ class WorldModel(nn.Module):
         if reward_from not in REWARD_FROM:
             raise ValueError(f"reward_from={reward_from!r}. Available: {', '.join(REWARD_FROM)}.")
         self.sizes: dict[str, int | float | str] = self_sizes  # what rebuilds this model: WorldModel(**sizes)
-        self.obs_dim, self.action_dim, self.latent_dim = obs_dim, action_dim, latent_dim
+        self.obs_dim, self.action_dim, self.memory_dim = obs_dim, action_dim, memory_dim
+        self.latent_dim = latent_dim + memory_dim
         self.num_q, self.reward_from = num_q, reward_from
 
+        code_dim, latent_dim = latent_dim, self.latent_dim
         pair = latent_dim + action_dim
         self.two_hot = TwoHot(num_bins, vmin, vmax)
         self.normalizer = Normalizer(obs_dim)
-        self.encoder = mlp([obs_dim, *[enc_dim] * enc_layers, latent_dim], out=SimNorm(simnorm_dim))
-        self.dynamics = Dynamics(latent_dim, action_dim, mlp_dim, simnorm_dim)
+        self.encoder = mlp([obs_dim - memory_dim, *[enc_dim] * enc_layers, code_dim], out=SimNorm(simnorm_dim))
+        self.dynamics = Dynamics(code_dim, memory_dim, action_dim, mlp_dim, simnorm_dim)
         self.reward_head = mlp([pair, mlp_dim, mlp_dim, num_bins], zero_out=True)
         self.q_ensemble = Ensemble(
             mlp([pair, mlp_dim, mlp_dim, num_bins], dropout=dropout, zero_out=True) for _ in range(num_q)
@@ -136,7 +158,9 @@ class WorldModel(nn.Module):
 
     def encode(self, observation: Tensor) -> Tensor:
         """Latent of a raw observation, [..., O] -> [..., D]."""
-        return by_blocks(lambda o: self.encoder(self.normalizer(o)), observation)
+        seen = self.obs_dim - self.memory_dim
+        code = by_blocks(lambda o: self.encoder(self.normalizer(o)[..., :seen]), observation)
+        return torch.cat([code, observation[..., seen:]], -1) if self.memory_dim else code
 
     def decode(self, z: Tensor) -> Tensor:
         """Leading entries of the observation in raw units, [..., decode_dim]. Never trains the latent."""
@@ -176,8 +200,22 @@ class WorldModel(nn.Module):
             raise ValueError("The dynamics already have a residual; add_residual works once.")
         self.dynamics.base.requires_grad_(False)
         pair = self.latent_dim + self.action_dim
-        residual = mlp([pair, mlp_dim, self.latent_dim], zero_out=True)
+        residual = mlp([pair, mlp_dim, self.dynamics.code_dim], zero_out=True)
         self.dynamics.residual = residual.to(next(self.parameters()).device)
+
+    @torch.no_grad()
+    def add_command_map(self) -> None:
+        """Let the dynamics learn what the machine makes of a command; starts as exactly the identity.
+
+        Raises:
+            ValueError: If there is one already.
+        """
+        if self.dynamics.command is not None:
+            raise ValueError("The dynamics already have a command map; add_command_map works once.")
+        command = nn.Linear(self.action_dim + self.memory_dim, self.action_dim)
+        command.weight.copy_(torch.eye(self.action_dim, self.action_dim + self.memory_dim))
+        command.bias.zero_()
+        self.dynamics.command = command.to(next(self.parameters()).device)
 
     @torch.no_grad()
     def update_targets(self, rate: float) -> None:

@@ -1,4 +1,4 @@
-"""A world that only counts, sent down the whole path: every slice must still count by one, and belong to one episode."""
+"""A world that only counts, sent down the whole path: every slice still counts by one in one episode."""
 
 import numpy as np
 import pytest

@@ -16,7 +16,8 @@ from pathlib import Path
 
 from mpc_sgft.run_folder import cpu_name
 
-COLUMNS = "task seed transitions updates episodes_evaluated success success_low success_high planner_success wall_seconds".split()
+COLUMNS = "task seed transitions updates episodes_evaluated success success_low success_high prior_success".split()
+COLUMNS += ["wall_seconds"]
 
 
 def main() -> None:

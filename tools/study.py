@@ -26,7 +26,9 @@ def main() -> None:
     parser.add_argument("--gaps", nargs="+", required=True)
     parser.add_argument("--methods", nargs="+", default=["sgft"])
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
-    parser.add_argument("--checkpoints", nargs="+", default=[None], help="run folders or files; default: the shipped one")
+    parser.add_argument(
+        "--checkpoints", nargs="+", default=[None], help="run folders or files; default: the shipped one"
+    )
     parser.add_argument("--vary", nargs="+", default=[], metavar="WORD", help="an override's name, then its values")
     parser.add_argument("--set", nargs="*", default=[], metavar="name=value", help="overrides of every run")
     parser.add_argument("--runs", type=Path, default=Path("runs/study"))

@@ -70,7 +70,9 @@ class Push(AbstractTask):
         spec.compiler.degree = False
         spec.option.timestep = self.sim_dt
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-        spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC  # the pyramid lets the puck slide 1.4 times too far on diagonals
+        spec.option.cone = (
+            mujoco.mjtCone.mjCONE_ELLIPTIC
+        )  # the pyramid lets the puck slide 1.4 times too far on diagonals
         world = spec.worldbody
         world.add_light(pos=[0.3, -0.6, 1.6], dir=[0, 0.35, -1], type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
         world.add_camera(name="side", pos=[1.25, -1.05, 0.75], xyaxes=[0.68, 0.73, 0, -0.36, 0.33, 0.87])

@@ -30,6 +30,8 @@ NUMBERS = dict(
     transfer_entropy_coef=1e-4,
     anchor=0.0,
     residual=False,
+    command_map=False,
+    command_lr=2e-2,
 )
 
 
