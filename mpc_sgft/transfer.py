@@ -53,7 +53,7 @@ class Transfer:
         memory: int,
     ):
         self.agent, self.updates, self.gate, self.margin, self.memory = agent, updates, gate, margin, memory
-        self.slice_len = slice_len
+        self.slice_len, self.anchor = slice_len, agent.anchor
         self.buffer = make_buffer(capacity=capacity, slice_len=slice_len, batch_size=batch_size, seed=seed)
         self.pretrained = copy.deepcopy(agent.model)
         self.acting: WorldModel = copy.deepcopy(agent.model)
@@ -76,6 +76,7 @@ class Transfer:
         """Judge a rollout [T], learn from all there are, and hand over the parts that may act; returns metrics."""
         verdict = self.judge(steps)
         self.buffer.extend(steps)
+        self.agent.anchor = self.anchor / len(self.verdicts)  # a prior weighs less, the more data there are
         metrics: dict[str, float] = {}
         for _ in range(self.updates):
             metrics = self.agent.update_transfer(self.buffer.sample())

@@ -32,12 +32,13 @@ LOG_STD_MIN, LOG_STD_MAX = -10.0, 2.0
 class Dynamics(nn.Module):
     """Latent dynamics. A latent z = [s, m] is a code s [D] and the last commands m, newest first [M].
 
-        c  = command(a, m)                              what the machine makes of its commands, here simply a
-        s' = SimNorm(f(s, m, c) [+ residual(s, m, c)])
-        m' = [a, m without its last command]            exact, so only s' is learned
+        c_i = sum_j W_j u_{i+j} + b for each command u_i of u = [a, m]   what the machine makes of its commands
+        s'  = SimNorm(f(s, c) [+ residual(s, c)])
+        m'  = [a, m without its last command]                            exact, so only s' is learned
 
-    At transfer `add_command_map` makes c an affine function of a and m, a gain, a rotation, a drift, a delay or a lag,
-    which starts as the identity; `add_residual` adds a correction that starts at zero.
+    Until `add_command_map` c is u. From then on W and b are learned, from the identity on: a gain, a rotation, a drift,
+    a delay, a lag, a few numbers that hold wherever the robot is. Commands older than the memory count as its oldest.
+    `add_residual` adds a correction that starts at zero.
     """
 
     def __init__(self, code_dim: int, memory_dim: int, action_dim: int, mlp_dim: int, simnorm_dim: int) -> None:
@@ -50,8 +51,13 @@ class Dynamics(nn.Module):
 
     def forward(self, z: Tensor, action: Tensor) -> Tensor:
         commands = torch.cat([action, z[..., self.code_dim :]], -1)  # newest first [..., A + M]
-        realised = action if self.command is None else self.command(commands)
-        x = torch.cat([z, realised], -1)  # [..., D + M + A]
+        realised = commands
+        if self.command is not None:
+            each = commands.unflatten(-1, (-1, action.shape[-1]))  # [..., K, A], K commands
+            lag = torch.arange(each.shape[-2], device=z.device)
+            window = each[..., (lag[:, None] + lag).clamp(max=len(lag) - 1), :]  # [..., K, K, A]
+            realised = self.command(window.flatten(-2)).flatten(-2)  # [..., K A]
+        x = torch.cat([z[..., : self.code_dim], realised], -1)  # [..., D + A + M]
         logits = self.base(x)
         code = simnorm(logits if self.residual is None else logits + self.residual(x), self.simnorm_dim)
         return torch.cat([code, commands[..., : self.memory_dim]], -1) if self.memory_dim else code
