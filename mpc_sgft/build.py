@@ -1,5 +1,6 @@
 """From a config to the objects of a run: the only place where names in yaml become things."""
 
+import logging
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +33,7 @@ def prepare_process(cfg: DictConfig) -> None:
     """Threads and memory of this process, for speed; call once at the start."""
     torch.set_num_threads(cfg.torch_threads)
     keep_freed_memory()
+    logging.getLogger("torchrl").setLevel(logging.WARNING)  # it announces every buffer it creates
 
 
 def make_env(cfg: DictConfig, num_envs: int, *, randomised: bool = False) -> ControlEnv:
