@@ -39,6 +39,10 @@ class Loaded(NamedTuple):
 
 def describe(cfg: DictConfig, model: WorldModel, extra: Mapping[str, Any] | None = None) -> dict[str, Any]:
     """Header of a checkpoint: task, sizes, history, discount, format version, the whole config, and `extra`."""
+    config = OmegaConf.to_container(cfg, resolve=True)
+    assert isinstance(config, dict)
+    for path in ("run_dir", "resume", "checkpoint"):  # where it was made is nobody else's business
+        config.pop(path, None)
     return {
         "format": FORMAT,
         "task": str(cfg.chosen.task),
@@ -47,7 +51,7 @@ def describe(cfg: DictConfig, model: WorldModel, extra: Mapping[str, Any] | None
         "sizes": dict(model.sizes),
         "residual": model.dynamics.residual is not None,
         "command_map": model.dynamics.command is not None,
-        "config": OmegaConf.to_container(cfg, resolve=True),
+        "config": config,
         **(extra or {}),
     }
 

@@ -30,7 +30,7 @@ def test_gain_scales_the_displacement(make_env, play) -> None:
         return (play(env, pushes)["observation"][-1, 0, :2] - env.reset()["observation"][0, :2]).numpy()
 
     whole = displacement({})
-    assert (whole > 0.05).all()
+    assert (whole > 0.04).all()
     # the arm's dry friction lets it stop some millimetres before its target
     np.testing.assert_allclose(displacement({"actuator_gain": {"gain": 0.5}}), 0.5 * whole, atol=0.004)
     np.testing.assert_allclose(

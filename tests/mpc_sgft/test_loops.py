@@ -14,13 +14,14 @@ from safetensors.torch import load_file
 
 from mpc_sgft.record import read_episode
 
-TINY = ["+experiment=debug", "task=pendulum", "log.tensorboard=false", "log.rerun=false", "--quiet"]
+TINY = ["+experiment=debug", "task=pendulum", "log.tensorboard=false", "log.rerun=false"]
 NEEDED = "task gap method seed real_rollouts aborted_rollouts zero_shot_success final_success rollouts_to_90".split()
 NEEDED += ["wall_seconds", "rrd"]
 
 
 def command(name: str, *words: str) -> list[str]:
-    return [sys.executable, "-m", f"mpc_sgft.{name}", *TINY, *words]
+    settings = [] if "--resume" in words else TINY  # a resumed run has its own
+    return [sys.executable, "-m", f"mpc_sgft.{name}", "--quiet", *settings, *words]
 
 
 def run(name: str, *words: str) -> subprocess.CompletedProcess:

@@ -1,14 +1,26 @@
 """The gate between what trains and what acts, and the command map that a few rollouts can teach."""
 
+from pathlib import Path
+
 import pytest
 import torch
+from omegaconf import OmegaConf
 from tensordict import TensorDict
 
+from mpc_sgft.agent import Agent
 from mpc_sgft.transfer import Transfer, open_loop_error
 from mpc_sgft.world_model import WorldModel
-from tests.mpc_sgft.test_agent import NUMBERS, SIZES, make_agent
 
+SIZES = {"obs_dim": 6, "action_dim": 2, "decode_dim": 3, "latent_dim": 16, "mlp_dim": 32, "enc_dim": 32, "num_q": 2}
+TRAIN = Path(__file__).resolve().parents[2] / "configs" / "train" / "default.yaml"
 MEMORY = {"memory_dim": 2, "action_dim": 1, "obs_dim": 6, "decode_dim": 2}
+
+
+def make_agent(sizes: dict | None = None, **changes) -> Agent:
+    torch.manual_seed(0)
+    numbers = {k: v for k, v in OmegaConf.load(TRAIN).agent.items() if k != "_target_"}
+    plain = {"anchor": 0.0, "command_map": False, "discount": 0.9}
+    return Agent(WorldModel(**(SIZES | (sizes or {}))), **(numbers | plain | changes))
 
 
 def rollout(model: WorldModel, steps: int = 12, seed: int = 0) -> TensorDict:
@@ -124,7 +136,7 @@ def test_a_command_map_starts_as_the_identity_and_recovers_gain_and_delay():
 
 
 def test_with_a_command_map_everything_else_stays_frozen():
-    agent = make_agent(sizes=MEMORY, **{k: v for k, v in NUMBERS.items() if k == "anchor"})
+    agent = make_agent(sizes=MEMORY)
     agent.freeze_for_transfer("sgft", horizon=2, command_map=True, anchor=0.1)
     before, frozen = agent.model.dynamics.command.weight.clone(), agent.frozen_hash()
     agent.update_transfer(rollout(agent.model, 6)[:4].unflatten(0, (2, 2)))

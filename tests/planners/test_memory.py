@@ -33,4 +33,4 @@ def test_memory_is_not_fetched_again() -> None:
         [sys.executable, "-c", FAULTS], cwd=root, capture_output=True, text=True, timeout=120, check=True
     )
     default, kept = map(int, run.stdout.split())
-    assert kept < 0.1 * default
+    assert kept <= 0.1 * default  # some C libraries learn to keep it by themselves: then both are nothing
