@@ -65,7 +65,7 @@ def score(episodes: TensorDict) -> Score:
     n, k = len(success), int(success.sum())
     interval = binomtest(k, n).proportion_ci(method="wilson")
     returns = (episodes["next", "reward"][..., 0] * first).sum(1)
-    return Score(n, k, k / n, interval.low, interval.high, float(returns.mean()))
+    return Score(n, k, k / n, float(interval.low), float(interval.high), float(returns.mean()))
 
 
 def planner_policy(model: WorldModel, planner, seed: int, *, explore: bool = False) -> Act:
