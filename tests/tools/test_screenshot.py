@@ -49,9 +49,10 @@ def test_the_picture_has_the_size_and_the_time_asked_for(rrd, tmp_path):
 
 
 def test_the_viewer_listens_on_loopback_only_and_is_gone_afterwards(rrd):
+    before = set(psutil.Process().children(recursive=True))  # this process may have others, of other tests
     try:
         with open_viewer(rrd):
-            children = psutil.Process().children(recursive=True)
+            children = [p for p in psutil.Process().children(recursive=True) if p not in before]
             listening = [c.laddr.ip for p in children for c in p.net_connections() if c.status == psutil.CONN_LISTEN]
             assert listening and set(listening) == {"127.0.0.1"}
     except ScreenshotError as error:
