@@ -79,7 +79,14 @@ class ControlEnv(EnvBase):
             raise FloatingPointError(f"action is not finite in environment {bad[0]}: {action[bad[0]]}")
         out = self.backend.send(action)
         self._clock += 1
-        self._observations = np.concatenate([out.observation[:, None], self._observations[:, :-1]], 1)
+        seen = np.where(out.invalid[:, None], self._observations[:, 0], out.observation)  # a failed state is not shown
+        reward = np.where(out.invalid, 0.0, out.reward)
+        for what, values in (("observation", seen), ("reward", reward[:, None])):
+            if not np.isfinite(values).all():
+                env, entry = np.argwhere(~np.isfinite(values))[0]
+                name = f" {self.task.observation_names[entry]}" if what == "observation" else ""
+                raise FloatingPointError(f"{what}{name} is not finite in environment {env}")
+        self._observations = np.concatenate([seen[:, None], self._observations[:, :-1]], 1)
         if self.history:
             self._actions = np.concatenate([action[:, None], self._actions[:, :-1]], 1)
         bad = torch.from_numpy(out.invalid)[:, None]
@@ -91,7 +98,7 @@ class ControlEnv(EnvBase):
                 "success": torch.from_numpy(out.success)[:, None] & ~bad,
                 "invalid": bad,
                 "action_sent": torch.from_numpy(out.action_sent.astype(np.float32)),
-                "reward": torch.from_numpy(np.nan_to_num(out.reward).astype(np.float32))[:, None],
+                "reward": torch.from_numpy(reward.astype(np.float32))[:, None],
                 "done": terminated | truncated,
                 "terminated": terminated,
                 "truncated": truncated,
@@ -104,4 +111,4 @@ class ControlEnv(EnvBase):
         flat = np.concatenate(
             [self._observations.reshape(len(self._observations), -1), self._actions.reshape(len(self._actions), -1)], 1
         )
-        return torch.from_numpy(np.nan_to_num(flat).astype(np.float32))
+        return torch.from_numpy(flat.astype(np.float32))

@@ -1,7 +1,7 @@
 """The front of the three commands: flags and overrides in, one checked config out, errors as one line.
 
 Order: parse (argparse alone: --help answers at once), compose and check (Hydra), import the loop (torch, mujoco), run.
-Exit codes: 0 or what the loop returns; 2 for what the user can mend; 130 after Ctrl-C.
+Exit codes: 0 or what the loop returns; 2: the user can mend it; 3: a number is not finite; 130: stopped by Ctrl-C.
 """
 
 from __future__ import annotations
@@ -77,6 +77,8 @@ def run(command: Command, argv: Sequence[str] | None = None) -> int:
         if message is None:
             raise
         return _fail(message, 2)
+    except FloatingPointError as err:
+        return _fail(f"{err} Stopped; the last checkpoint of the run is good, --resume goes on from there.", 3)
     except Stopped as stop:
         print(f"\n{stop}", file=sys.stderr)
         return 130

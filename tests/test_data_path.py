@@ -80,3 +80,12 @@ def test_success_is_read_at_the_end_of_the_first_episode():
     result = score(data)
     assert (result.episodes, result.successes) == (3, 2)  # the unstable episode did not succeed
     assert result.success_low < 2 / 3 < result.success_high
+
+
+def test_an_observation_that_is_not_finite_stops_and_is_named():
+    world = Counter(2)
+    env = ControlEnv(world)
+    state = env.reset()
+    world.count[1] = np.nan
+    with pytest.raises(FloatingPointError, match="observation count is not finite in environment 1"):
+        env.step(state.set("action", torch.zeros(2, 1)))
