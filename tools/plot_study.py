@@ -1,6 +1,6 @@
 """Learning curves of a study: median over seeds with a bootstrap interval, a panel for each gap.
 
-python tools/plot_study.py results/transfer.csv docs/transfer.png
+python tools/plot_study.py results/transfer_sgft.csv results/transfer_tdmpc2.csv docs/transfer.png
 """
 
 import argparse
@@ -18,13 +18,14 @@ from scipy.stats import bootstrap
 COLOURS = {"sgft": "#1f77b4", "tdmpc2": "#d62728"}
 
 
-def read(path: Path) -> dict[str, dict[str, dict[int, list[float]]]]:
+def read(paths: list[Path]) -> dict[str, dict[str, dict[int, list[float]]]]:
     """gap -> label -> rollouts -> success of each seed."""
     curves: dict = defaultdict(lambda: defaultdict(lambda: defaultdict(list)))
-    with path.open() as file:
-        for row in csv.DictReader(file):
-            label = " ".join(x for x in (row["method"], row["variant"]) if x)
-            curves[row["gap"]][label][int(row["rollouts"])].append(float(row["success"]))
+    for path in paths:
+        with path.open() as file:
+            for row in csv.DictReader(file):
+                label = " ".join(x for x in (row["method"], row["variant"]) if x)
+                curves[row["gap"]][label][int(row["rollouts"])].append(float(row["success"]))
     return curves
 
 
@@ -38,7 +39,7 @@ def interval(values: list[float]) -> tuple[float, float]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("csv", type=Path)
+    parser.add_argument("csv", type=Path, nargs="+")
     parser.add_argument("png", type=Path)
     args = parser.parse_args()
     curves = read(args.csv)
@@ -55,7 +56,7 @@ def main() -> None:
         axis.grid(alpha=0.3)
     seeds = max(len(v) for methods in curves.values() for points in methods.values() for v in points.values())
     axes[0][0].set_ylabel(f"success, mean of {seeds} seeds, 95 % bootstrap")
-    axes[0][-1].legend(frameon=False)
+    axes[0][0].legend(frameon=False)
     figure.tight_layout()
     args.png.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(args.png, dpi=130)
