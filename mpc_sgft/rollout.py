@@ -76,6 +76,8 @@ def planner_policy(model: WorldModel, planner, seed: int, *, explore: bool = Fal
 
     def act(observation: Tensor, fresh: Tensor) -> Tensor:
         nonlocal previous
+        if fresh.all():
+            previous = None  # nothing to warm-start from, and the number of environments may have changed
         with torch.inference_mode():
             z = model.encode(observation.to(device))
             previous = planner.plan(model, z, previous, fresh.to(device), generator, explore=explore)

@@ -139,9 +139,9 @@ def test_a_sliding_puck_stops_after_v_squared_over_two_mu_g(make_task, mu) -> No
     model, data = _scene(task, {"contact_friction": {"coefficient": mu}}, task.home()[0])
     speed, start = 0.4, data.qpos[7].copy()
     data.qvel[7:] = [speed, 0, 0, 0, 0, 0]
-    mujoco.mj_step(model, data, nstep=round(2 * speed / (mu * 9.81) / task.sim_dt))
+    mujoco.mj_step(model, data, nstep=round(4 * speed / (mu * 9.81) / task.sim_dt))
     assert data.qpos[7] - start == pytest.approx(speed**2 / (2 * mu * 9.81), rel=0.08)
-    assert abs(data.qvel[7]) < 2e-3
+    assert abs(data.qvel[7]) < 1e-3
 
 
 def test_contact_friction_decides_over_the_other_geom() -> None:

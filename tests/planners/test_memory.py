@@ -33,4 +33,6 @@ def test_memory_is_not_fetched_again() -> None:
         [sys.executable, "-c", FAULTS], cwd=root, capture_output=True, text=True, timeout=120, check=True
     )
     default, kept = map(int, run.stdout.split())
-    assert kept <= 0.1 * default  # some C libraries learn to keep it by themselves: then both are nothing
+    if default == 0:
+        pytest.skip("this C library keeps freed memory by itself here: nothing to compare with")
+    assert kept < 0.1 * default
