@@ -1,6 +1,5 @@
 """An episode as a film."""
 
-import os
 from pathlib import Path
 
 import torch
@@ -18,7 +17,6 @@ def write_video(path: Path, env: ControlEnv, act: Act, seed: int) -> Path:
     Raises:
         UserError: If imageio's extra is not installed, or MuJoCo finds no way to draw here.
     """
-    os.environ.setdefault("MUJOCO_GL", "egl")
     try:
         import imageio.v2 as imageio
         import mujoco
@@ -28,7 +26,7 @@ def write_video(path: Path, env: ControlEnv, act: Act, seed: int) -> Path:
     try:
         renderer = mujoco.Renderer(model, *SIZE)
     except (mujoco.FatalError, RuntimeError, AttributeError) as error:
-        raise UserError(f"MuJoCo cannot draw here ({error}); try MUJOCO_GL=osmesa or MUJOCO_GL=egl") from error
+        raise UserError(f"MuJoCo cannot draw here ({error}). Without a screen set MUJOCO_GL=egl (or osmesa) before the command") from error
     data = mujoco.MjData(model)
     env.set_seed(seed)
     state, fresh = env.reset(), torch.ones(1, dtype=torch.bool)
