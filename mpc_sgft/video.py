@@ -26,7 +26,9 @@ def write_video(path: Path, env: ControlEnv, act: Act, seed: int) -> Path:
     try:
         renderer = mujoco.Renderer(model, *SIZE)
     except (mujoco.FatalError, RuntimeError, AttributeError) as error:
-        raise UserError(f"MuJoCo cannot draw here ({error}). Without a screen set MUJOCO_GL=egl (or osmesa) before the command") from error
+        raise UserError(
+            f"MuJoCo cannot draw here ({error}). Without a screen set MUJOCO_GL=egl (or osmesa) before the command"
+        ) from error
     data = mujoco.MjData(model)
     env.set_seed(seed)
     state, fresh = env.reset(), torch.ones(1, dtype=torch.bool)
