@@ -8,7 +8,6 @@ full disk or a kill leaves the earlier one.
 import hashlib
 import io
 import json
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,6 +18,7 @@ from omegaconf import DictConfig, OmegaConf
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
+from mpc_sgft.whole_file import write_whole
 from mpc_sgft.world_model import WorldModel
 
 DIGEST_BYTES = 32  # SHA-256 in front of a saved state
@@ -64,7 +64,7 @@ def save(path: Path | str, model: WorldModel, meta: Mapping[str, Any]) -> None:
     """
     tensors = {name: x.detach().cpu().contiguous() for name, x in model.state_dict().items()}
     header = {"mpc_sgft": json.dumps(dict(meta)), "sha256": _digest(tensors)}
-    _replace(Path(path), safetensors.torch.save(tensors, metadata=header))
+    write_whole(Path(path), safetensors.torch.save(tensors, metadata=header))
 
 
 def load(
@@ -130,7 +130,7 @@ def save_state(path: Path | str, state: Mapping[str, Any]) -> None:
     payload = io.BytesIO()
     torch.save(dict(state), payload)
     data = payload.getvalue()
-    _replace(Path(path), hashlib.sha256(data).digest() + data)
+    write_whole(Path(path), hashlib.sha256(data).digest() + data)
 
 
 def load_state(path: Path | str) -> dict[str, Any]:
@@ -158,24 +158,3 @@ def _digest(tensors: Mapping[str, Tensor]) -> str:
         digest.update(f"{name} {tuple(x.shape)} {x.dtype}".encode())
         digest.update(x.numpy().tobytes())
     return digest.hexdigest()
-
-
-def _replace(path: Path, data: bytes) -> None:
-    """Write beside `path`, flush to disk, then take its place in one step."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        with open(temporary, "wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except OSError as err:
-        raise OSError(err.errno, err.strerror, str(path)) from err  # name the file that was wanted
-    finally:
-        temporary.unlink(missing_ok=True)
-    folder = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(folder)
-    finally:
-        os.close(folder)

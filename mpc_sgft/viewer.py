@@ -34,14 +34,12 @@ from mpc_sgft.blueprint import Layout, blueprint
 from mpc_sgft.episode_view import Candidates, EpisodeView, Rows, log_episode, log_series_styles
 from mpc_sgft.robot_view import RobotView
 from mpc_sgft.value_image import log_value_map
+from mpc_sgft.whole_file import write_whole
 
 __all__ = ["Candidates", "EpisodeView", "Layout", "RunViewer"]
 
-RRD_MAGIC, RRD_HEADER, RRD_FRAME = (
-    b"RRF",
-    12,
-    struct.Struct("<QQ"),
-)  # bytes before the first frame; kind and length of a frame
+RRD_MAGIC, RRD_HEADER = b"RRF", 12  # how a file begins; bytes before its first frame
+RRD_FRAME, RRD_FOOTER = struct.Struct("<QQ"), 0  # kind and length of a frame; the kind after the last message
 
 
 class RunViewer:
@@ -73,10 +71,10 @@ class RunViewer:
         self._step, self._episode = 0, 0
         aside = self.path.with_suffix(".earlier.rrd")
         chunks = _set_aside(self.path, aside) if resume else []
-        self.path.open("xb").close()
-        self._recording = rr.RecordingStream("mpc_sgft")
-        self._recording.set_log_time_enabled(False)
-        self._recording.save(self.path, default_blueprint=blueprint(model, layout, control_dt))
+        # Rerun's own file sink may wait forever on a full disk, so the bytes are taken from memory and written here.
+        self._file = self.path.open("xb", buffering=0)
+        self._blueprint = blueprint(model, layout, control_dt)
+        self._start()
         self._robot = RobotView(self._recording, model, "world/robot") if model is not None else None
         if chunks:
             self._take_over(chunks)
@@ -150,6 +148,12 @@ class RunViewer:
     def close(self) -> None:
         """Finish the file with its index; the viewer cannot be used afterwards."""
         self._flush()
+        self._file.close()
+        self._recording.disconnect()
+        chunks = _chunks(self.path)
+        self._start()
+        self._recording.send_chunks(chunks)
+        write_whole(self.path, self._stream.read() or b"")
         self._recording.disconnect()
 
     def __enter__(self) -> Self:
@@ -157,6 +161,13 @@ class RunViewer:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+    def _start(self) -> None:
+        """A recording in memory, which begins with the blueprint."""
+        self._recording = rr.RecordingStream("mpc_sgft")
+        self._recording.set_log_time_enabled(False)
+        self._stream = self._recording.binary_stream()
+        self._recording.send_blueprint(self._blueprint, make_active=False, make_default=True)
 
     def _at(self, step: int) -> None:
         self._recording.set_time("env_step", sequence=step)
@@ -180,16 +191,30 @@ class RunViewer:
                 self._episode = max(self._episode, *(row + 1 for row in batch.column("episode").to_pylist()))
 
     def _flush(self) -> None:
-        """Wait until everything is in the file."""
+        """Put everything so far into the file."""
         self._recording.reset_time()
+        new = self._stream.read() or b""  # a whole file: header, messages, footer
+        data = new[0 if self._file.tell() == 0 else RRD_HEADER : _end_of_messages(new)]
         try:
-            self._recording.flush()
-        except RuntimeError as error:
-            raise OSError(f"{self.path} could not be written ({error}): is the disk full?") from error
+            while data:
+                data = data[self._file.write(data) :]
+        except OSError as error:
+            raise OSError(error.errno, error.strerror, str(self.path)) from error
+
+
+def _end_of_messages(data: bytes) -> int:
+    """Where the last whole message of a rerun file ends: before its footer, or before a half-written message."""
+    at = RRD_HEADER
+    while at + RRD_FRAME.size <= len(data):
+        kind, length = RRD_FRAME.unpack_from(data, at)
+        if kind == RRD_FOOTER or at + RRD_FRAME.size + length > len(data):
+            break
+        at += RRD_FRAME.size + length
+    return at
 
 
 def _set_aside(path: Path, aside: Path) -> list[Chunk]:
-    """Move the file of a resumed run to `aside` and return what it holds, without a half-written frame at its end.
+    """Move the file of a resumed run to `aside` and return what it holds.
 
     Raises:
         OSError: If it is no rerun recording; it then stays where it was.
@@ -197,24 +222,28 @@ def _set_aside(path: Path, aside: Path) -> list[Chunk]:
     source = aside if aside.exists() else path  # aside is there if an earlier take-over was killed: it holds more
     if not source.exists():
         return []
-    data = source.read_bytes()
-    if data[: len(RRD_MAGIC)] != RRD_MAGIC[: len(data)]:
-        raise OSError(f"{source} is no rerun recording: it starts with {data[:4]!r}. Move it away to resume.")
-    whole = RRD_HEADER
-    while whole + RRD_FRAME.size <= len(data):
-        end = whole + RRD_FRAME.size + RRD_FRAME.unpack_from(data, whole)[1]
-        if end > len(data):
-            break
-        whole = end
-    chunks: list[Chunk] = []
-    if whole > RRD_HEADER:
-        with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
-            warnings.filterwarnings("ignore", message=".*no footer.*")  # as expected of a killed run
-            readable = Path(folder) / path.name
-            readable.write_bytes(data[:whole])
-            chunks = RrdReader(readable).stream().to_chunks()
+    chunks = _chunks(source)
     if source == path:
         path.rename(aside)
     else:
         path.unlink(missing_ok=True)
     return chunks
+
+
+def _chunks(path: Path) -> list[Chunk]:
+    """What a file holds, without a half-written message at its end.
+
+    Raises:
+        OSError: If it is no rerun recording.
+    """
+    data = path.read_bytes()
+    if data[: len(RRD_MAGIC)] != RRD_MAGIC[: len(data)]:
+        raise OSError(f"{path} is no rerun recording: it starts with {data[:4]!r}. Move it away to resume.")
+    whole = _end_of_messages(data)
+    if whole <= RRD_HEADER:
+        return []
+    with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".*no footer.*")  # only `close` writes one
+        readable = Path(folder) / path.name
+        readable.write_bytes(data[:whole])
+        return RrdReader(readable).stream().to_chunks()
