@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 from safetensors.torch import load_file
 
+from mpc_sgft import deploy
 from mpc_sgft.record import read_episode
 
 TINY = ["+experiment=debug", "task=pendulum", "log.tensorboard=false", "log.rerun=false"]
@@ -137,18 +138,19 @@ def test_the_scripted_pendulum_swings_up(tmp_path):
         (["model=5M"], "latent_dim"),
     ],
 )
-def test_bad_input_is_one_clear_line(pretrained, tmp_path, words, says):
+def test_bad_input_is_one_clear_line(pretrained, tmp_path, capsys, words, says):
     given = words if any(w.startswith("checkpoint") for w in words) else [f"checkpoint={pretrained}", *words]
-    done = run("deploy", f"run_dir={tmp_path / 'r'}", *given)
-    assert done.returncode == 2, done.stderr
-    assert says in done.stderr and "Traceback" not in done.stderr
+    assert deploy.main(["--quiet", *TINY, f"run_dir={tmp_path / 'r'}", *given]) == 2
+    err = capsys.readouterr().err
+    assert says in err and "Traceback" not in err
 
 
-def test_a_corrupt_checkpoint_is_named(pretrained, tmp_path):
+def test_a_corrupt_checkpoint_is_named(pretrained, tmp_path, capsys):
     bad = tmp_path / "bad.safetensors"
     bad.write_bytes((pretrained / "checkpoint" / "model.safetensors").read_bytes()[:-100])
-    done = run("deploy", f"checkpoint={bad}", f"run_dir={tmp_path / 'r'}")
-    assert done.returncode == 2 and "bad.safetensors" in done.stderr and "Traceback" not in done.stderr
+    assert deploy.main(["--quiet", *TINY, f"checkpoint={bad}", f"run_dir={tmp_path / 'r'}"]) == 2
+    err = capsys.readouterr().err
+    assert "bad.safetensors" in err and "Traceback" not in err
 
 
 def wait_for(path: Path, process: subprocess.Popen, seconds: float = 120) -> None:
