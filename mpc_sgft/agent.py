@@ -1,18 +1,18 @@
-"""World model + optimisers: act(), update() in pretraining, update_transfer() on real data."""
+"""World model + optimisers: update() in pretraining, update_transfer() on real data."""
 
 import copy
 import hashlib
 from collections.abc import Mapping
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from mpc_sgft import losses
 from mpc_sgft.slices import check_finite, to_slices
 from mpc_sgft.world_model import WorldModel
-from planners.base import Model, Plan
 
 METHODS = {  # the parts that train at transfer
     "sgft": ("dynamics", "policy_head"),
@@ -22,23 +22,8 @@ METHODS = {  # the parts that train at transfer
 PRETRAINED = METHODS["tdmpc2"]
 
 
-class Planner(Protocol):
-    """Anything in planners/."""
-
-    def plan(
-        self,
-        model: Model,
-        z: Tensor,
-        previous: Plan | None,
-        fresh: Tensor | None,
-        generator: torch.Generator,
-        keep_candidates: bool = False,
-        explore: bool = False,
-    ) -> Plan: ...
-
-
 class Agent:
-    """Acts through a planner and learns; the numbers are explained in configs/train/default.yaml.
+    """Trains a world model; the numbers are explained in configs/train/default.yaml.
 
     Args:
         model: Trained in place.
@@ -64,6 +49,7 @@ class Agent:
         value_weight: float,
         decoder_weight: float,
         target_rate: float,
+        average_decay: float,
         scale_rate: float,
         entropy_coef: float,
         entropy_lr: float,
@@ -94,46 +80,17 @@ class Agent:
         self.generator = torch.Generator(self.device).manual_seed(seed)
         self.scale = losses.RunningScale(scale_rate, self.device)
         self.log_entropy_coef = torch.tensor(entropy_coef, device=self.device).log().requires_grad_()
+        self._averaged = AveragedModel(self.model, multi_avg_fn=get_ema_multi_avg_fn(average_decay))
         self.method: str | None = None  # None while pretraining
         self.horizon = 0
         self.trainable: tuple[str, ...] = (*PRETRAINED, "normalizer", "target_q")
         self._anchored: list[Tensor] = []
         self._make_optimizers(lr, lr)
 
-    # -- acting --------------------------------------------------------------------------------------------------------
-
-    @torch.inference_mode()
-    def act(
-        self,
-        observation: Tensor,
-        planner: Planner,
-        previous: Plan | None,
-        fresh: Tensor | None,
-        generator: torch.Generator,
-        *,
-        explore: bool = False,
-        keep_candidates: bool = False,
-    ) -> Plan:
-        """Plan from raw observations.
-
-        Args:
-            observation: [B, O].
-            planner: Any of planners/.
-            previous: What this method returned a step earlier, to warm-start from.
-            fresh: Where the episode has just begun, bool [B].
-            generator: Of the candidates' noise, on the agent's device.
-            explore: Execute a sample around the plan instead of its mean.
-            keep_candidates: Return all candidates too.
-
-        Raises:
-            FloatingPointError: If the observation is not finite.
-        """
-        observation = observation.to(self.device)
-        if not observation.isfinite().all():
-            bad = (~observation.isfinite()).nonzero()[0].tolist()
-            raise FloatingPointError(f"observation is not finite, first at [environment, entry] = {bad}.")
-        z = self.model.encode(observation)
-        return planner.plan(self.model, z, previous, fresh, generator, keep_candidates=keep_candidates, explore=explore)
+    @property
+    def averaged(self) -> WorldModel:
+        """The model with its weights averaged over the last updates of pretraining: what is evaluated and saved."""
+        return self._averaged.module
 
     def scale_learning_rates(self, share: float) -> None:
         """Set the pretraining learning rates to a share of the configured ones."""
@@ -188,6 +145,8 @@ class Agent:
 
         metrics |= self._update_policy(zs.detach())
         model.update_targets(self.target_rate)
+        if self.method is None:
+            self._averaged.update_parameters(model)
         metrics["target_value"] = target_q.mean()
         return _floats(metrics)
 
@@ -351,6 +310,7 @@ class Agent:
             "transfer": transfer,
             "anchored": [x.clone() for x in self._anchored],
             "model": {name: x.detach().clone() for name, x in self.model.state_dict().items()},
+            "averaged": self._averaged.state_dict() if self.method is None else None,
             "snapshot": self.snapshot(),
             "generator": self.generator.get_state(),
             "torch_rng": torch.get_rng_state(),
@@ -361,6 +321,8 @@ class Agent:
         if state["transfer"]["method"] is not None:
             self.freeze_for_transfer(**state["transfer"])
         self.model.load_state_dict(state["model"])
+        if state["averaged"] is not None:
+            self._averaged.load_state_dict(state["averaged"])
         self._anchored = [x.to(self.device) for x in state["anchored"]]
         self.restore(state["snapshot"])
         self.generator.set_state(state["generator"].cpu())

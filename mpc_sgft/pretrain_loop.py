@@ -40,8 +40,8 @@ def pretrain(cfg: DictConfig) -> int:
 
     def save() -> None:
         """Weights and exact state, at the end of a round."""
-        meta = checkpoint.describe(cfg, agent.model, extra={"transitions": state["transitions"]})
-        checkpoint.save(folder / "checkpoint" / "model.safetensors", agent.model, meta)
+        meta = checkpoint.describe(cfg, agent.averaged, extra={"transitions": state["transitions"]})
+        checkpoint.save(folder / "checkpoint" / "model.safetensors", agent.averaged, meta)
         checkpoint.save_state(saved, {"loop": state, "agent": agent.state_dict(), "buffer": buffer.state_dict()})
 
     stop = StopRequest("round")
@@ -91,7 +91,7 @@ def pretrain(cfg: DictConfig) -> int:
     final_judge = build.make_env(cfg, cfg.final_episodes, randomised=True)
     final = score(collect(final_judge, prior(agent), seed=EVAL_SEED + 1))
     planner = build.make_planner(cfg, env.action_dim)
-    planned = score(collect(final_judge, planner_policy(agent.model, planner, cfg.seed), seed=EVAL_SEED + 1))
+    planned = score(collect(final_judge, planner_policy(agent.averaged, planner, cfg.seed), seed=EVAL_SEED + 1))
     summary = {
         "task": cfg.chosen.task,
         "seed": cfg.seed,
@@ -132,8 +132,8 @@ def explorer(agent: Agent, cfg: DictConfig, round_number: int) -> Act:
 
 
 def prior(agent: Agent) -> Act:
-    """The policy prior's mean action."""
-    return planner_policy(agent.model, PolicyPlanner(action_dim=agent.model.action_dim, horizon=1), 0)
+    """The mean action of the averaged policy prior."""
+    return planner_policy(agent.averaged, PolicyPlanner(action_dim=agent.model.action_dim, horizon=1), 0)
 
 
 class StopRequest:

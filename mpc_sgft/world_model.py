@@ -51,16 +51,26 @@ class Dynamics(nn.Module):
 
     def forward(self, z: Tensor, action: Tensor) -> Tensor:
         commands = torch.cat([action, z[..., self.code_dim :]], -1)  # newest first [..., A + M]
-        realised = commands
-        if self.command is not None:
-            each = commands.unflatten(-1, (-1, action.shape[-1]))  # [..., K, A], K commands
-            lag = torch.arange(each.shape[-2], device=z.device)
-            window = each[..., (lag[:, None] + lag).clamp(max=len(lag) - 1), :]  # [..., K, K, A]
-            realised = self.command(window.flatten(-2)).flatten(-2)  # [..., K A]
-        x = torch.cat([z[..., : self.code_dim], realised], -1)  # [..., D + A + M]
+        x = torch.cat([z[..., : self.code_dim], self.realised(commands)], -1)  # [..., D + A + M]
         logits = self.base(x)
         code = simnorm(logits if self.residual is None else logits + self.residual(x), self.simnorm_dim)
         return torch.cat([code, commands[..., : self.memory_dim]], -1) if self.memory_dim else code
+
+    def realised(self, commands: Tensor) -> Tensor:
+        """What the machine makes of commands, newest first, [..., K A] -> [..., K A]."""
+        if self.command is None:
+            return commands
+        each = commands.unflatten(-1, (-1, self.command.out_features))  # [..., K, A]
+        lag = torch.arange(each.shape[-2], device=commands.device)
+        longest = self.command.in_features // self.command.out_features
+        window = (lag[:, None] + torch.arange(longest, device=commands.device)).clamp(max=len(lag) - 1)
+        return self.command(each[..., window, :].flatten(-2)).flatten(-2)
+
+    def as_simulated(self, z: Tensor) -> Tensor:
+        """The latent with its commands as the machine realised them: what the simulator would have called them."""
+        if self.command is None or not self.memory_dim:
+            return z
+        return torch.cat([z[..., : self.code_dim], self.realised(z[..., self.code_dim :])], -1)
 
 
 class WorldModel(nn.Module):
@@ -152,8 +162,8 @@ class WorldModel(nn.Module):
         return by_blocks(lambda s, a: self.two_hot.decode(self.reward_head(torch.cat([s, a], -1))), seen, action)
 
     def terminal_value(self, z: Tensor) -> Tensor:
-        """V(z), discounted reward units, [...]."""
-        return by_blocks(lambda s: self.two_hot.decode(self.value_head(s)), z)
+        """V(z), discounted reward units, [...]; at transfer the frozen V sees each command as it was realised."""
+        return by_blocks(lambda s: self.two_hot.decode(self.value_head(self.dynamics.as_simulated(s))), z)
 
     def policy_prior(self, z: Tensor, noise: Tensor | None) -> Tensor:
         """Action of the policy in [-1, 1], [..., A]; noise None gives tanh of the mean."""

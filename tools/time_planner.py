@@ -15,6 +15,7 @@ import platform
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from statistics import median
 
@@ -24,6 +25,7 @@ from omegaconf import OmegaConf
 from tensordict import TensorDict
 
 from mpc_sgft.agent import Agent
+from mpc_sgft.rollout import planner_policy
 from mpc_sgft.world_model import WorldModel
 from planners.memory import keep_freed_memory
 from planners.mppi import MPPI
@@ -114,13 +116,12 @@ def jobs(size: str, many: bool) -> list[tuple[str, int, int, int, Callable[[], o
     model: WorldModel = instantiate(OmegaConf.load(ROOT / f"configs/model/{size}.yaml"), **sizes)
     train = OmegaConf.load(ROOT / "configs/train/default.yaml")
     agent: Agent = instantiate(train.agent, model=model, discount=0.99)
-    generator = torch.Generator().manual_seed(0)
     out: list[tuple[str, int, int, int, Callable[[], object]]] = []
     for horizon in (3, 4):
         planner = MPPI(action_dim=action_dim, horizon=horizon, **SEARCH)
         for envs in (1, 100) if many and size == "small" and horizon == 4 else (1,):
-            observation = torch.randn(envs, obs_dim)
-            act = lambda p=planner, o=observation: agent.act(o, p, None, None, generator)  # noqa: E731
+            act, fresh = planner_policy(model, planner, seed=0), torch.ones(envs, dtype=torch.bool)
+            act = partial(act, torch.randn(envs, obs_dim), fresh)
             out.append(("plan", horizon, envs, envs * plan_flop(model, planner), act))
         batch = random_batch(obs_dim, action_dim, horizon)
         out.append(("update", horizon, BATCH, update_flop(model, horizon), lambda b=batch: agent.update(b)))

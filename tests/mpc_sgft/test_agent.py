@@ -1,5 +1,7 @@
 """What trains, what stays, and that it learns."""
 
+import copy
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -7,7 +9,6 @@ from torch.testing import assert_close
 
 from mpc_sgft.agent import METHODS, Agent
 from mpc_sgft.world_model import PARTS, WorldModel
-from planners.policy import PolicyPlanner
 
 SIZES = dict(obs_dim=6, action_dim=2, decode_dim=3, latent_dim=16, mlp_dim=32, enc_dim=32, num_q=2)
 NUMBERS = dict(
@@ -24,6 +25,7 @@ NUMBERS = dict(
     target_rate=0.01,
     scale_rate=0.01,
     entropy_coef=0.01,
+    average_decay=0.5,
     entropy_lr=1e-3,
     transfer_lr=3e-4,
     transfer_policy_lr=3e-4,
@@ -228,6 +230,23 @@ def test_a_policy_update_leaves_no_gradient_in_the_critics():
     assert all(p.grad is None for p in agent.model.q_ensemble.parameters())
 
 
+def test_the_average_is_of_the_weights_after_each_update():
+    agent = make_agent()
+    weight, seen = agent.model.policy_head[0].linear.weight, []
+    for i in range(3):
+        agent.update(make_batch(i))
+        seen.append(weight.detach().clone())
+    assert_close(agent.averaged.policy_head[0].linear.weight, seen[0] / 4 + seen[1] / 4 + seen[2] / 2)
+    assert_close(agent.averaged.normalizer.mean, agent.model.normalizer.mean)
+    state = copy.deepcopy(agent.state_dict())
+    agent.update(make_batch(7))
+    resumed = make_agent()
+    resumed.load_state_dict(state)
+    resumed.update(make_batch(7))
+    for a, b in zip(agent.averaged.state_dict().values(), resumed.averaged.state_dict().values(), strict=True):
+        assert torch.equal(a, b)
+
+
 def test_value_and_decoder_never_train_the_encoder():
     quiet = dict(consistency_weight=0.0, reward_weight=0.0, q_weight=0.0, value_weight=1.0, decoder_weight=1.0)
     agent = make_agent(**quiet)
@@ -260,16 +279,3 @@ def test_a_loss_that_is_not_finite_is_named_and_changes_nothing():
     with pytest.raises(FloatingPointError, match="^reward_loss is not finite"):
         agent.update(make_batch())
     assert changed(before, parts(agent)) == {"normalizer", "reward_head"}  # nan is never equal to itself
-
-
-def test_act_returns_a_plan_and_names_a_bad_observation():
-    agent = make_agent()
-    generator = torch.Generator().manual_seed(0)
-    planner = PolicyPlanner(action_dim=2, horizon=2, discount=0.9)
-    plan = agent.act(torch.randn(3, 6), planner, None, torch.ones(3, dtype=torch.bool), generator)
-    assert plan.action.shape == (3, 2)
-    assert_close(plan.action, plan.action.clamp(-1, 1))
-    bad = torch.randn(3, 6)
-    bad[1, 4] = torch.inf
-    with pytest.raises(FloatingPointError, match=r"\[1, 4\]"):
-        agent.act(bad, planner, plan, None, generator)

@@ -87,6 +87,23 @@ def test_decoder_returns_raw_units_and_never_trains_the_latent():
     assert (model.decode(z) - 100).abs().max() < 20
 
 
+def test_the_value_sees_commands_as_the_simulator_would_have_called_them():
+    """A machine that does half of what it is told: V of real commands is V of their halves."""
+    model = tiny(memory_dim=4)
+    z = model.encode(torch.randn(20, 10))
+    model.value_head[-1].weight.data.normal_()
+    before = model.terminal_value(z)
+    model.add_command_map()
+    assert torch.equal(model.terminal_value(z), before)
+    with torch.no_grad():
+        model.dynamics.command.weight.mul_(0.5)
+    halved = torch.cat([z[:, :-4], 0.5 * z[:, -4:]], 1)
+    after = model.terminal_value(z)
+    model.dynamics.command = None
+    assert_close(after, model.terminal_value(halved))
+    assert not torch.allclose(after, before)
+
+
 def test_residual_starts_exactly_equal_and_only_it_trains():
     model = tiny()
     z, action = model.encode(torch.randn(64, 10)).detach(), torch.rand(64, 2)
