@@ -113,20 +113,29 @@ def pretrain(cfg: DictConfig) -> int:
 
 
 def explorer(agent: Agent, cfg: DictConfig, round_number: int) -> Act:
-    """The policy with its own noise; in a share of the environments more noise, so that the model sees mistakes."""
-    generator = torch.Generator().manual_seed(_seed(cfg.seed, round_number))
-    sample = planner_policy(
-        agent.model,
-        PolicyPlanner(action_dim=agent.model.action_dim, horizon=1),
-        _seed(cfg.seed, round_number),
-        explore=True,
-    )
+    """The policy with its own noise; a share of the environments also makes detours, so that the model sees mistakes.
+
+    A detour holds one action for some steps: none at all, or one drawn uniformly. Without, the critic never learns what
+    it is worth to rest where the puck should lie, because the policy, whose actions are noisy, never rests.
+    """
+    seed, detour = _seed(cfg.seed, round_number), cfg.detours
+    generator = torch.Generator().manual_seed(seed)
+    policy = PolicyPlanner(action_dim=agent.model.action_dim, horizon=1)
+    sample = planner_policy(agent.model, policy, seed, explore=True)
+    roaming = int(detour.share * cfg.num_envs)
+    left = torch.zeros(roaming, dtype=torch.long)  # steps of the detour that are left
+    held = torch.zeros(roaming, policy.action_dim)
 
     def act(observation: Tensor, fresh: Tensor) -> Tensor:
         action = sample(observation, fresh)
-        noisy = int(cfg.noisy_share * len(action))
-        action[:noisy] += cfg.extra_noise * torch.randn(noisy, action.shape[1], generator=generator)
-        return action.clamp(-1, 1)
+        chance, kind = torch.rand(2, roaming, generator=generator)
+        length = torch.randint(*detour.steps, (roaming,), generator=generator)
+        drawn = 2 * torch.rand(roaming, policy.action_dim, generator=generator) - 1
+        starts = (left == 0) & (chance < detour.rate)
+        left[:] = torch.where(starts, length, (left - 1).clamp(min=0))
+        held[starts] = torch.where(kind < detour.rest, 0.0, drawn.T).T[starts]
+        action[:roaming] = torch.where((left > 0)[:, None], held, action[:roaming])
+        return action
 
     return act
 
