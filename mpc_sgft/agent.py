@@ -3,7 +3,7 @@
 import copy
 import hashlib
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, cast
 
 import torch
 from tensordict import TensorDictBase
@@ -90,7 +90,7 @@ class Agent:
     @property
     def averaged(self) -> WorldModel:
         """The model with its weights averaged over the last updates of pretraining: what is evaluated and saved."""
-        return self._averaged.module
+        return cast(WorldModel, self._averaged.module)
 
     def scale_learning_rates(self, share: float) -> None:
         """Set the pretraining learning rates to a share of the configured ones."""

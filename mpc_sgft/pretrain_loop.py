@@ -129,7 +129,7 @@ def explorer(agent: Agent, cfg: DictConfig, round_number: int) -> Act:
     def act(observation: Tensor, fresh: Tensor) -> Tensor:
         action = sample(observation, fresh)
         chance, kind = torch.rand(2, roaming, generator=generator)
-        length = torch.randint(*detour.steps, (roaming,), generator=generator)
+        length = torch.randint(detour.steps[0], detour.steps[1], (roaming,), generator=generator)
         drawn = 2 * torch.rand(roaming, policy.action_dim, generator=generator) - 1
         starts = (left == 0) & (chance < detour.rate)
         left[:] = torch.where(starts, length, (left - 1).clamp(min=0))
