@@ -10,6 +10,8 @@ from mujoco.batch import Batch
 from numpy.typing import NDArray
 
 from envs.backends.base import Outcome
+from envs.backends.friction import LoadFriction
+from envs.effects.backlash import place_rotors
 from envs.effects.base import Effect
 from envs.randomize import Draw, Randomizer
 from envs.task import AbstractTask, Array, whole_steps
@@ -26,6 +28,9 @@ class SimBackend:
     Within a control period the actuator signal moves linearly to its new value. A simulation that MuJoCo stops with a
     warning, or whose state is not finite, is unstable: its periods are marked invalid until it is reset, and it is
     counted in `counters` and logged once.
+
+    Effects may add joints and actuators without an input behind those of the task's scene; nobody is told of them:
+    `qpos`, `qvel`, controls and forces are those of the nominal scene.
 
     Args:
         task: What is simulated.
@@ -53,18 +58,23 @@ class SimBackend:
     ):
         self.task, self.num_envs, self.effects = task, num_envs, effects or []
         spec = task.spec()
+        self.nominal = nominal = spec.copy().compile()
         for effect in self.effects:
             effect.edit_spec(spec)
         self.model = spec.compile()
         self.batch = Batch(self.model, num_envs, min(threads or _cores(), num_envs))
-        self.qpos, self.qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
+        self.state = self.batch.bind("qpos"), self.batch.bind("qvel")
+        self.qpos, self.qvel = self.state[0][:, : nominal.nq], self.state[1][:, : nominal.nv]
         self.signal, self.act = self.batch.bind("ctrl"), self.batch.bind("act")
         self.clock, self.delayed = self.batch.bind("time"), self.batch.bind("history")
-        self.applied = self.batch.bind("qfrc_applied")
+        self.applied = self.batch.bind("qfrc_applied")[:, : nominal.nv]
+        self.told = np.zeros((num_envs, nominal.nu))  # control signals before the effects that change them
         self.randomizer = Randomizer(self.batch, self.model, draws or [])
         self.noise_sd, self.noise_probability = noise_sd, noise_probability
         self.steps = whole_steps(task.control_dt, task.sim_dt)
         self.has_force = any(type(e).force is not Effect.force for e in self.effects)
+        self.dry = LoadFriction(self.batch, nominal, self.effects)
+        self.actuators = [nominal.actuator(i).name for i in range(nominal.nactuator)]
         self.counters: Counter[str] = Counter()
         self.slots = [_history_values(self.model, i) for i in range(self.model.nu)]
         self.record = ("qpos", "qvel", "actuator_force")
@@ -76,6 +86,7 @@ class SimBackend:
         self.seed(0)
         for effect in self.effects:  # a parameter that does not fit the task stops here, not in the first episode
             effect.command(np.zeros((1, task.action_dim)), task)
+            self._change(np.zeros((1, nominal.nu)))
             nothing = np.zeros((1, len(task.observation_names)))
             effect.sense(nothing, lambda _, same=nothing: same, lambda k: np.zeros((1, k)), task)
 
@@ -87,13 +98,19 @@ class SimBackend:
     def reset(self, sims: NDArray[np.int_]) -> Array:
         rngs = [self.rngs[i] for i in sims]
         self.batch.reset(np.asarray(sims, np.int32), stage=mujoco.mjtStage.mjSTAGE_NONE)
+        self.dry.take_off(sims)
         self.randomizer.draw([int(i) for i in sims], rngs)
+        self.dry.take_over(sims)
         for i, rng in zip(sims, rngs, strict=True):
             start = self.task.start(rng)
             self.qpos[i], self.qvel[i], self.target[i] = start.qpos[0], start.qvel[0], start.target[0]
             self.noisy[i] = rng.uniform() < self.noise_probability
-        ctrl = self.task.ctrl(self.target[sims], self.qpos[sims, : self.model.nu])
-        self.signal[sims], self.unstable[sims] = ctrl, False
+        whole = self.state[0][sims], self.state[1][sims]
+        place_rotors(self.model, *whole)
+        self.state[0][sims], self.state[1][sims] = whole
+        self.told[sims] = told = self.task.ctrl(self.target[sims], self.qpos[sims, : self.model.nu])
+        self.signal[sims] = ctrl = self._change(told)
+        self.unstable[sims] = False
         if self.model.na:
             self.act[sims] = ctrl
         for actuator, slots in enumerate(self.slots):
@@ -112,11 +129,12 @@ class SimBackend:
         for effect in self.effects:
             realised = effect.command(realised, self.task)
         self.target = self.task.move(self.target, realised)
-        before = self.signal.copy()
+        before = self.told
         ramp = np.linspace(0, 1, self.steps + 1)[1:, None]
         ctrl = before[:, None] + ramp * (self.task.ctrl(self.target, before) - before)[:, None]  # [N, S, nu]
+        self.told = ctrl[:, -1].copy()
         start = float(self.clock[0])
-        moved = self._advance(ctrl)
+        moved = self._advance(self._change(ctrl.reshape(-1, ctrl.shape[2])).reshape(ctrl.shape))
         time = start + np.linspace(self.task.sim_dt, self.task.control_dt, self.steps)
         self._last = {"time": time, "ctrl": ctrl, **moved}
         if self.remembers:
@@ -133,7 +151,8 @@ class SimBackend:
         )
 
     def positions(self) -> Array:
-        return self.qpos[0].copy()
+        """Joint positions of the first simulation, as `model` has them: with the rotors of a gear that has play."""
+        return self.state[0][0].copy()
 
     def samples(self) -> dict[str, Array]:
         """As `Backend.samples`, thinned to 125 Hz at 4 ms."""
@@ -143,24 +162,31 @@ class SimBackend:
         return {"time": last["time"][pick]} | {k: last[k][0, pick] for k in ("qpos", "qvel", "ctrl", "force")}
 
     def describe(self) -> dict[str, object]:
-        model = self.model
-        return {
-            "joint_names": [model.joint(i).name for i in range(model.njnt)],
-            "actuator_names": [model.actuator(i).name for i in range(model.nu)],
-        }
+        joints = [self.nominal.joint(i).name for i in range(self.nominal.njnt)]
+        return {"joint_names": joints, "actuator_names": self.actuators}
+
+    def _change(self, told: Array) -> Array:
+        """What effects at named actuators make of control signals [T, nu]; the others act on the action."""
+        for effect in self.effects:
+            if effect.place == "actuator" and getattr(effect, "at", ()):
+                told = effect.ctrl(told, self.actuators)
+        return told
 
     def _advance(self, ctrl: Array) -> dict[str, Array]:
         """Simulate one period; a force that depends on the state is renewed at each physics step."""
-        if not self.has_force:
+        if not self.has_force and not self.dry.effects:
             out = self.batch.rollout(self.steps, control=ctrl, control_spec=CTRL, record=self.record)
         else:
             parts = []
             for k in range(self.steps):
                 forces = (e.force(self.qpos, self.qvel) for e in self.effects)
                 self.applied[:] = sum(f for f in forces if f is not None)
+                self.dry.update()
                 parts.append(self.batch.rollout(1, control=ctrl[:, k : k + 1], control_spec=CTRL, record=self.record))
             out = {name: np.concatenate([p[name] for p in parts], 1) for name in self.record}
-        return {"qpos": out["qpos"], "qvel": out["qvel"], "force": out["actuator_force"]}
+        sizes = {"qpos": self.nominal.nq, "qvel": self.nominal.nv, "actuator_force": self.nominal.nactuator}
+        qpos, qvel, force = (out[name][..., :size] for name, size in sizes.items())
+        return {"qpos": qpos, "qvel": qvel, "force": force}
 
     def _sense(self, truth: Array, sims: NDArray[np.int_]) -> Array:
         """What the sensors of some environments read, [n, O]; each has its own noise."""

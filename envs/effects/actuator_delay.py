@@ -14,6 +14,7 @@ class ActuatorDelay(Effect):
 
     delay: float = 0.0
     at: tuple[str, ...] = ()  # actuators; all if empty
+    place: ClassVar[str] = "actuator"
     units: ClassVar[dict[str, str]] = {"delay": "s"}
     bounds: ClassVar[dict[str, tuple[float, float]]] = {"delay": (0.0, 2.0)}
 

@@ -14,6 +14,7 @@ class ActuatorLag(Effect):
 
     time_constant: float = 0.0
     at: tuple[str, ...] = ()  # actuators; all if empty
+    place: ClassVar[str] = "actuator"
     units: ClassVar[dict[str, str]] = {"time_constant": "s"}
     bounds: ClassVar[dict[str, tuple[float, float]]] = {"time_constant": (0.0, 5.0)}
 

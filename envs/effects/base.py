@@ -2,6 +2,11 @@
 
 An effect is physics that reality has and the nominal simulator lacks: one file each, a frozen dataclass whose fields
 are its parameters. `load` builds a list of them from a mapping, as in configs/gap/*.yaml.
+
+Two users apply them. A task's simulation calls `edit_spec`, `command`, `force`, `friction`, `sense`, and `ctrl` of
+effects that sit `at` named actuators. A solver that has a bare MJCF and recorded signals calls `edit_spec`, then `ctrl`
+on the recorded controls and `measured` on the simulated signals; what `friction` gives it applies along the recorded
+motion. An effect never does the same thing in two of these places.
 """
 
 import importlib
@@ -18,17 +23,22 @@ from numpy.typing import NDArray
 from envs.task import AbstractTask
 
 Array = NDArray[np.float64]
+ROTOR = "backlash/"  # names of the joints that the effect backlash adds begin so
 
 
 @dataclass(frozen=True)
 class Effect:
-    """Base of all effects: four hooks that do nothing.
+    """Base of all effects: hooks that do nothing.
 
     Attributes:
+        native: True if an MJCF after `edit_spec` carries the whole effect, so that plain MuJoCo shows it.
+        place: Kind of the elements that `at` names: joint, actuator, body, geom, signal, or "" for the whole scene.
         units: Unit of each numeric parameter.
         bounds: Physically sensible range of each numeric parameter; values outside are refused.
     """
 
+    native: ClassVar[bool] = True
+    place: ClassVar[str] = ""
     units: ClassVar[dict[str, str]] = {}
     bounds: ClassVar[dict[str, tuple[float, float]]] = {}
 
@@ -46,8 +56,29 @@ class Effect:
         """Change the action [N, A] between the interface and the machine."""
         return action
 
+    def ctrl(self, ctrl: Array, actuators: list[str]) -> Array:
+        """Change control signals [T, nu] on their way to the actuators; what `edit_spec` carries is not repeated here.
+
+        Args:
+            ctrl: What was sent, in units of each actuator's control, one row each moment.
+            actuators: Name of each column.
+
+        Raises:
+            ValueError: For an actuator in `at` that is not among them.
+        """
+        return ctrl
+
     def force(self, qpos: Array, qvel: Array) -> Array | None:
         """Generalised force [N, nv] to add, N or N m; None if there is none."""
+        return None
+
+    def friction(self, load: Array, joints: list[str]) -> Array | None:
+        """Dry friction [N, nv] to add, N or N m; None if there is none. It acts like MuJoCo's `dof_frictionloss`.
+
+        Args:
+            load: Generalised force of all actuators, `qfrc_actuator`, [N, nv].
+            joints: Name of each column's joint.
+        """
         return None
 
     def sense(
@@ -63,12 +94,22 @@ class Effect:
         """
         return observation
 
+    def measured(self, values: Array, name: str, time: Array) -> Array:
+        """What a sensor reads of one true signal, [T]; noise is left out.
+
+        Args:
+            values: The true signal, [T].
+            name: Its name, as `at` would call it: an observation of a task, or `qpos/<joint>` of recorded data.
+            time: When each value holds, [T] in s.
+        """
+        return values
+
 
 def available() -> list[str]:
     """Names of the effects, which are the names of the files in this folder."""
     import envs.effects as package
 
-    return sorted(m.name for m in pkgutil.iter_modules(package.__path__) if m.name not in ("base",))
+    return sorted(m.name for m in pkgutil.iter_modules(package.__path__) if m.name not in ("base", "passive"))
 
 
 def load(effects: Mapping[str, Mapping[str, Any] | None]) -> list[Effect]:
@@ -117,11 +158,37 @@ def per_axis(value: float | tuple[float, ...], size: int, what: str) -> Array:
 def pick(elements: list[Any], at: tuple[str, ...], kind: str) -> list[Any]:
     """The scene's elements with the names in `at`, or all of them if `at` is empty.
 
+    "All" are those of the machine itself: no rotors that the effect backlash added, and never an actuator without an
+    input, which is how other effects enter a scene.
+
     Raises:
         ValueError: For a name that the scene lacks.
     """
+    if kind == "actuator":
+        elements = [e for e in elements if e.ctrlspec != int(mujoco.mjtCtrlInput.mjINPUT_NONE)]
+    if kind == "joint" and not at:
+        elements = [e for e in elements if not e.name.startswith(ROTOR)]
     names = [e.name for e in elements]
+    indices(names, at, kind)
+    return [e for e in elements if not at or e.name in at]
+
+
+def indices(names: list[str], at: tuple[str, ...], kind: str) -> list[int]:
+    """Where the names in `at` stand among `names`; everywhere if `at` is empty.
+
+    Raises:
+        ValueError: For a name that is not there.
+    """
     for name in at:
         if name not in names:
             raise ValueError(f"No {kind} {name!r} in this scene. Available: {', '.join(n for n in names if n)}.")
-    return [e for e in elements if not at or e.name in at]
+    return [i for i, name in enumerate(names) if not at or name in at]
+
+
+def per_name(value: float | tuple[float, ...], names: tuple[str, ...], what: str) -> dict[str, float]:
+    """One number for all names, or one each, by name.
+
+    Raises:
+        ValueError: If there are neither one nor as many numbers as names.
+    """
+    return dict(zip(names, np.broadcast_to(per_axis(value, len(names), what), len(names)).tolist(), strict=True))

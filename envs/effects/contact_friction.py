@@ -14,6 +14,7 @@ class ContactFriction(Effect):
 
     coefficient: float = 1.0
     at: tuple[str, ...] = ("puck",)  # geoms
+    place: ClassVar[str] = "geom"
     units: ClassVar[dict[str, str]] = {"coefficient": "1"}
     bounds: ClassVar[dict[str, tuple[float, float]]] = {"coefficient": (0.0, 10.0)}
 

@@ -6,6 +6,7 @@ from typing import ClassVar
 import mujoco
 
 from envs.effects.base import Effect, pick
+from envs.effects.passive import stiff_dry_friction
 
 
 @dataclass(frozen=True)
@@ -14,16 +15,14 @@ class CoulombFriction(Effect):
 
     torque: float = 0.0
     at: tuple[str, ...] = ()  # joints; all hinges and slides if empty
+    place: ClassVar[str] = "joint"
     units: ClassVar[dict[str, str]] = {"torque": "N m or N"}
     bounds: ClassVar[dict[str, tuple[float, float]]] = {"torque": (0.0, 1e4)}
 
     def edit_spec(self, spec: mujoco.MjSpec) -> None:
         for joint in pick(spec.joints, self.at, "joint"):
             if self.at or joint.type != mujoco.mjtJoint.mjJNT_FREE:
-                joint.frictionloss += self.torque
-                # the default impedance leaves a creep of some per cent
-                joint.solimp_friction[:3] = [0.99, 0.9999, 0.001]
-                joint.solref_friction[:2] = [0.002, 1.0]
+                stiff_dry_friction(joint, self.torque)
 
 
 EFFECT = CoulombFriction

@@ -22,6 +22,7 @@ class FrameRotation(Effect):
     angle: float = 0.0
     at: str = "base"
     centre: tuple[float, float] = (0.25, 0.0)  # of the camera's turn, in the task frame
+    native: ClassVar[bool] = False
     units: ClassVar[dict[str, str]] = {"angle": "rad", "centre": "m"}
     bounds: ClassVar[dict[str, tuple[float, float]]] = {"angle": (-np.pi, np.pi)}
 

@@ -15,6 +15,7 @@ class Payload(Effect):
     mass: float = 0.0
     at: tuple[str, ...] = ("link7",)  # bodies
     position: tuple[float, float, float] = (0.0, 0.0, 0.0)  # in the body's frame
+    place: ClassVar[str] = "body"
     units: ClassVar[dict[str, str]] = {"mass": "kg", "position": "m"}
     bounds: ClassVar[dict[str, tuple[float, float]]] = {"mass": (0.0, 100.0)}
 

@@ -25,7 +25,9 @@ class SensorNoise(Effect):
     """Add white Gaussian noise to what is observed."""
 
     sd: float = 0.0
-    at: tuple[str, ...] = ()  # observation names; all if empty
+    at: tuple[str, ...] = ()  # observation names, or signals of recorded data; all if empty
+    native: ClassVar[bool] = False
+    place: ClassVar[str] = "signal"
     units: ClassVar[dict[str, str]] = {"sd": "of the observation"}
     bounds: ClassVar[dict[str, tuple[float, float]]] = {"sd": (0.0, 10.0)}
 

@@ -19,6 +19,7 @@ class StateTorque(Effect):
     amplitude: float = 0.0
     phase: float = 0.0
     rate: float = 0.0
+    native: ClassVar[bool] = False
     units: ClassVar[dict[str, str]] = {"amplitude": "N m", "phase": "rad", "rate": "N m s/rad"}
     bounds: ClassVar[dict[str, tuple[float, float]]] = {"amplitude": (-100.0, 100.0), "rate": (-100.0, 100.0)}
 

@@ -14,6 +14,7 @@ class ViscousFriction(Effect):
 
     coefficient: float = 0.0
     at: tuple[str, ...] = ()  # joints; all hinges and slides if empty
+    place: ClassVar[str] = "joint"
     units: ClassVar[dict[str, str]] = {"coefficient": "N m s/rad or N s/m"}
     bounds: ClassVar[dict[str, tuple[float, float]]] = {"coefficient": (0.0, 1e5)}
 

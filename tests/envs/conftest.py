@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 import pytest
 import torch
@@ -29,6 +30,37 @@ def make_task() -> Callable[..., Any]:
         return getattr(importlib.import_module(module), kind)(**numbers)
 
     return make
+
+
+@pytest.fixture
+def build() -> Callable[..., mujoco.MjModel]:
+    """build(xml, gap): the scene with the effects of a gap; an MjSpec is taken as well, and not changed."""
+
+    def make(scene: str | mujoco.MjSpec, gap: dict[str, Any] | None = None) -> mujoco.MjModel:
+        spec = mujoco.MjSpec.from_string(scene) if isinstance(scene, str) else scene.copy()
+        for effect in effects.load(gap or {}):
+            effect.edit_spec(spec)
+        return spec.compile()
+
+    return make
+
+
+@pytest.fixture
+def simulate() -> Callable[..., tuple[np.ndarray, np.ndarray]]:
+    """simulate(model, ctrl [T, nu], qpos, qvel): positions [T, nq] and speeds [T, nv] after each step of ctrl."""
+
+    def run(model: mujoco.MjModel, ctrl: np.ndarray, qpos: Any = None, qvel: Any = None):
+        data, moved = mujoco.MjData(model), []
+        data.qpos[: len(qpos if qpos is not None else [])] = [] if qpos is None else qpos
+        data.qvel[: len(qvel if qvel is not None else [])] = [] if qvel is None else qvel
+        effects.place_rotors(model, data.qpos, data.qvel)
+        for signal in ctrl:
+            data.ctrl[:] = signal
+            mujoco.mj_step(model, data)
+            moved.append((data.qpos.copy(), data.qvel.copy()))
+        return np.array([m[0] for m in moved]), np.array([m[1] for m in moved])
+
+    return run
 
 
 @pytest.fixture

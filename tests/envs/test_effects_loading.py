@@ -14,9 +14,11 @@ NAMES = effects.available()
 def test_the_folder_holds_what_the_project_promises() -> None:
     promised = (
         "actuator_gain actuator_offset actuator_delay actuator_lag viscous_friction coulomb_friction payload "
-        "contact_friction sensor_offset sensor_noise sensor_delay frame_rotation state_torque"
+        "contact_friction sensor_offset sensor_noise sensor_delay frame_rotation state_torque asymmetric_friction "
+        "stribeck_friction load_dependent_friction quadratic_drag armature torque_saturation deadband backlash "
+        "joint_stiffness gravity_tilt contact_softness sensor_gain"
     )
-    assert set(promised.split()) <= set(NAMES)
+    assert set(promised.split()) == set(NAMES)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -81,6 +83,11 @@ def test_values_out_of_bounds_are_refused(effect, message) -> None:
         ("push", {"sensor_offset": {"at": ["tip_z"]}}, "push observes no 'tip_z'. It observes: tip_x, tip_y"),
         ("push", {"sensor_noise": {"at": ["tip_z"]}}, "push observes no 'tip_z'"),
         ("push", {"sensor_delay": {"at": ["tip_z"]}}, "push observes no 'tip_z'"),
+        ("push", {"backlash": {"gap": 0.1, "at": ["puck"]}}, "joint 'puck' is a ball or free"),
+        ("push", {"deadband": {"at": ["motor"]}}, "No actuator 'motor' in this scene. Available: position1"),
+        ("push", {"load_dependent_friction": {"at": ["elbow"]}}, "No joint 'elbow' in this scene. Available: joint1"),
+        ("push", {"sensor_gain": {"gain": [1, 1]}}, "sensor_gain.gain=.*2 numbers; give one, or 4"),
+        ("push", {"torque_saturation": {"at": ["motor"]}}, "No actuator 'motor' in this scene"),
         ("push", {"actuator_gain": {"gain": [1, 1, 1]}}, "actuator_gain.gain=.*3 numbers; give one, or 2"),
         ("push", {"actuator_offset": {"offset": [0, 0, 0]}}, "actuator_offset.offset=.*3 numbers; give one, or 2"),
         ("push", {"sensor_offset": {"offset": [0, 0]}}, "sensor_offset.offset=.*2 numbers; give one, or 4"),

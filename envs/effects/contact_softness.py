@@ -1,0 +1,42 @@
+"""Things give way where they touch: foam, rubber, a mat."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import mujoco
+import numpy as np
+
+from envs.effects.base import Effect, pick
+
+
+@dataclass(frozen=True)
+class ContactSoftness(Effect):
+    """Add to the time constant of geoms' contacts (`geom_solref`); their damping ratio stays.
+
+    A contact's stiffness falls with the square of its time constant. Named geoms decide in each of their contacts
+    (`priority`); without names all contacts get softer by the same. Contacts listed as `<pair>` with numbers of their
+    own are left alone.
+    """
+
+    time_constant: float = 0.0
+    at: tuple[str, ...] = ()  # geoms; all if empty
+    place: ClassVar[str] = "geom"
+    units: ClassVar[dict[str, str]] = {"time_constant": "s"}
+    bounds: ClassVar[dict[str, tuple[float, float]]] = {"time_constant": (0.0, 1.0)}
+
+    def edit_spec(self, spec: mujoco.MjSpec) -> None:
+        if not self.time_constant:
+            return
+        for geom in pick(spec.geoms, self.at, "geom"):
+            first, second = geom.solref
+            if first > 0:
+                geom.solref[0] = first + self.time_constant
+            else:  # (-stiffness, -damping): the same damping ratio at a longer time constant
+                own = 2 / (geom.solimp[1] * -second)
+                scale = own / (own + self.time_constant)
+                geom.solref = np.array([first * scale**2, second * scale])
+            if self.at:
+                geom.priority = max(geom.priority, 1)
+
+
+EFFECT = ContactSoftness
