@@ -1,0 +1,70 @@
+"""Find where simulation and measurement disagree, name the missing effect, repair the model.
+
+    from mpc_sgft.diagnose import diagnose
+    report = diagnose("scene.xml", ["episodes/"], out=Path("out"))
+
+`record -> replay -> locate -> fit -> name -> repair -> report`, one file each.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import mujoco
+
+    from mpc_sgft.diagnose.report import Report
+
+__all__ = ["diagnose"]
+
+
+def diagnose(
+    model: str | Path | mujoco.MjModel | mujoco.MjSpec,
+    data: Sequence[str | Path],
+    *,
+    out: Path | None = None,
+    effects: Sequence[str] | None = None,
+    signals: Sequence[str] | None = None,
+    window: float | None = None,
+    held_out: float | Sequence[str] | None = None,
+    uncertain: Mapping[str, float] | None = None,
+    seed: int = 0,
+    max_effects: int = 3,
+    progress: bool = False,
+) -> Report:
+    """Compare a model with measurements and say what it lacks.
+
+    Args:
+        model: MJCF file, spec, or the model that was compiled last.
+        data: Episode files (CSV, Parquet, MCAP) and folders of them.
+        out: Folder for report.json, report.html, report.rrd, repaired.xml and effects.yaml; nothing is written if None.
+        effects: Names of the only effects to consider; all that the data can show if None.
+        signals: Compared columns, such as `qpos/elbow`; all positions and measured forces if None.
+        window: Length of a simulated window [s]; chosen from the data if None.
+        held_out: Share of the data that is never fitted, or names of episodes; a quarter if None.
+        uncertain: Nominal quantities (mass, gain, length, inertia, armature, damping) -> share by which they may be
+            wrong. They are refitted in the baseline and in every candidate.
+        seed: Of the bootstrap and the residual model.
+        max_effects: Largest set of effects.
+        progress: Show a progress bar on stderr.
+
+    Raises:
+        UserError: For data or a model that cannot be used; the message says what came and what to do.
+    """
+    from mpc_sgft.diagnose.run import run
+
+    return run(
+        model,
+        data,
+        out=out,
+        effects=effects,
+        signals=signals,
+        window=window,
+        held_out=held_out,
+        uncertain=uncertain or {},
+        seed=seed,
+        max_effects=max_effects,
+        progress=progress,
+    )

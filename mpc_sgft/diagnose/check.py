@@ -1,0 +1,125 @@
+"""From columns to episodes: names, time, numbers and units are checked, gaps split, jitter evened out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from difflib import get_close_matches
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from mpc_sgft.diagnose.record import MIN_SAMPLES, Array, Episode, Index, Table
+from mpc_sgft.errors import UserError
+
+KINDS = ("qpos", "qvel", "force", "sensor")
+GAP = 3.5  # a pause longer than this many sample times starts a new episode
+JITTER = 0.01  # of a sample time; more is interpolated away
+DEGREES, MILLIMETRES = 20.0, 200.0  # how many times the model's range a reading must exceed to be taken for these
+
+
+def episodes(table: Table, actuators: Sequence[str], joints: dict[str, tuple[float, float]]) -> list[Episode]:
+    """The uninterrupted pieces of one file.
+
+    Args:
+        table: What was read.
+        actuators: The model's actuators.
+        joints: The model's hinges and slides -> range [rad or m], (-inf, inf) where it has none.
+
+    Raises:
+        UserError: If a column is missing or misnamed, time is not increasing, a number is not finite, units do not
+            fit the model, nothing moves, or there are too few samples.
+    """
+    columns = table.columns
+    _names(table, actuators, list(joints))
+    time = columns["time"]
+    bad = [name for name, values in columns.items() if _known(name) and not np.isfinite(values).all()]
+    if bad:
+        row = int(np.flatnonzero(~np.isfinite(columns[bad[0]]))[0])
+        raise UserError(f"{table.name}: {bad[0]} is not a number in row {row}. Cut or fill such rows first.")
+    if len(time) < MIN_SAMPLES:
+        raise UserError(f"{table.name}: {len(time)} samples; at least {MIN_SAMPLES} are needed.")
+    steps = np.diff(time)
+    if (steps <= 0).any():
+        row = int(np.flatnonzero(steps <= 0)[0]) + 1
+        raise UserError(f"{table.name}: time does not increase at row {row} ({time[row - 1]:g} to {time[row]:g} s).")
+    dt = float(np.median(steps))
+    if dt > 0.2:
+        raise UserError(f"{table.name}: one sample every {dt:g} s. `time` is in seconds; is this milliseconds?")
+    _units(table, joints)
+    _moves(table, actuators, list(joints))
+    notes = (f"{table.name}: {table.lost}",) if table.lost else ()
+    cuts = np.flatnonzero(steps > GAP * dt) + 1
+    pieces = [p for p in np.split(np.arange(len(time)), cuts) if len(p) >= MIN_SAMPLES]
+    if len(cuts):
+        notes += (f"{table.name}: {len(cuts)} pauses in the recording; read as {len(pieces)} episodes",)
+    built = []
+    for k, rows in enumerate(pieces):
+        name = table.name if len(pieces) == 1 else f"{table.name}#{k}"
+        built.append(_even(name, columns, rows, dt, actuators, list(joints), notes if k == 0 else ()))
+    return built
+
+
+def _known(name: str) -> bool:
+    return name == "time" or name.split("/")[0] in ("ctrl", *KINDS)
+
+
+def _names(table: Table, actuators: Sequence[str], joints: Sequence[str]) -> None:
+    """Every actuator and every joint of the model needs its column; no ctrl column may be strange to the model."""
+    has = list(table.columns)
+    wanted = ["time", *(f"ctrl/{a}" for a in actuators), *(f"qpos/{j}" for j in joints)]
+    missing = [name for name in wanted if name not in has]
+    if missing:
+        near = {name: get_close_matches(name, has, 1, 0.5) for name in missing}
+        hints = [f"{name} (nearest: {match[0]})" if match else name for name, match in near.items()]
+        raise UserError(f"{table.name}: columns missing: {', '.join(hints)}. The file has: {', '.join(has)}.")
+    for kind, known in (("ctrl", actuators), ("force", actuators), ("qvel", joints)):
+        for name in has:
+            if name.startswith(f"{kind}/") and name.split("/", 1)[1] not in known:
+                what = "joint" if kind == "qvel" else "actuator"
+                raise UserError(f"{table.name}: {name}: the model has no such {what}. It has: {', '.join(known)}.")
+
+
+def _units(table: Table, joints: dict[str, tuple[float, float]]) -> None:
+    for joint, (low, high) in joints.items():
+        if not np.isfinite([low, high]).all():
+            continue
+        seen = np.abs(table.columns[f"qpos/{joint}"]).max()
+        limit = max(abs(low), abs(high))
+        if seen > MILLIMETRES * limit:
+            raise UserError(
+                f"{table.name}: qpos/{joint} reaches {seen:g}, the model's range is {limit:g}: millimetres?"
+            )
+        if seen > DEGREES * limit:
+            raise UserError(f"{table.name}: qpos/{joint} reaches {seen:g}, the model's range is {limit:g}: degrees?")
+
+
+def _moves(table: Table, actuators: Sequence[str], joints: Sequence[str]) -> None:
+    still = all(np.ptp(table.columns[f"qpos/{j}"]) == 0 for j in joints)
+    constant = all(np.ptp(table.columns[f"ctrl/{a}"]) == 0 for a in actuators)
+    if still:
+        what = "and the commands are constant too" if constant else "although the commands change"
+        raise UserError(f"{table.name}: no joint moves, {what}. Record motion: nothing can be learned from this.")
+
+
+def _even(
+    name: str,
+    columns: dict[str, Array],
+    rows: Index,
+    dt: float,
+    actuators: Sequence[str],
+    joints: Sequence[str],
+    notes: tuple[str, ...],
+) -> Episode:
+    """One piece on an even clock: positions by cubic interpolation, commands as they were held."""
+    time = columns["time"][rows]
+    even = time[0] + dt * np.arange(int((time[-1] - time[0]) / dt + 1e-6) + 1)
+    jitter = len(even) != len(time) or bool(np.abs(time - even).max() > JITTER * dt)
+    held = np.clip(np.searchsorted(time, even + 1e-9, side="right") - 1, 0, len(time) - 1)
+
+    def smooth(values: Array) -> Array:
+        return CubicSpline(time, values)(even) if jitter else values
+
+    ctrl = np.stack([columns[f"ctrl/{a}"][rows][held] for a in actuators], 1) if actuators else np.zeros((len(even), 0))
+    wanted = [n for n in columns if n.split("/")[0] in KINDS]
+    wanted = [n for n in wanted if not n.startswith("qpos/") or n.split("/", 1)[1] in joints]
+    return Episode(name, dt, ctrl, {n: smooth(columns[n][rows]) for n in wanted}, notes)

@@ -1,0 +1,198 @@
+"""Simulation error as least squares: whitened residuals, errors of the start projected out, bounded Gauss-Newton."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from mpc_sgft.diagnose.library import Term
+from mpc_sgft.diagnose.plant import Change
+from mpc_sgft.diagnose.record import Array, Index
+from mpc_sgft.diagnose.replay import Replayer
+
+MAX_POINTS = 40  # residuals per window and signal; more samples are averaged
+STEP = 1e-2  # finite differences, in typical sizes of a parameter
+TOLERANCE = 1e-3  # relative gain of an iteration that is too small to go on
+ITERATIONS = 12
+PRIOR = 1e3  # weight of a parameter's prior, in typical sizes: a floor that keeps unseen parameters in place
+
+
+class Fit(NamedTuple):
+    """A structure with its best parameters on the windows it was fitted to.
+
+    Attributes:
+        terms: Nominal quantities first, then effects.
+        values: One array [p] each term.
+        r: Whitened residuals of the fitted windows, [W, m].
+        J: Their derivatives by the parameters in typical sizes, [W, m, P].
+    """
+
+    terms: tuple[Term, ...]
+    values: tuple[Array, ...]
+    r: Array
+    J: Array
+
+    @property
+    def cost(self) -> float:
+        return float(np.mean(self.r**2))
+
+
+def change_of(terms: Sequence[Term], values: Sequence[Array]) -> Change:
+    total = Change()
+    for term, value in zip(terms, values, strict=True):
+        if not np.array_equal(value, term.neutral):
+            total = total + term.build(value)
+    return total
+
+
+class Problem:
+    """Residuals of structures over windows.
+
+    Args:
+        replayer: Simulates.
+        sigma: Noise of each signal, one sample, [S].
+        floor: Error of the simulator itself, per signal, [S].
+        start_sd: Uncertainty of each window's start, [W, 2 nj]; projected out.
+        sensitivity: Derivative of the predictions by the start, [W, n, S, 2 nj].
+    """
+
+    def __init__(self, replayer: Replayer, sigma: Array, floor: Array, start_sd: Array, sensitivity: Array):
+        self.replayer, self.sigma, self.floor = replayer, sigma, floor
+        n = replayer.windows.samples
+        self.stride = max(1, n // MAX_POINTS)
+        self.blocks = n // self.stride
+        self.scale = np.sqrt(sigma**2 / self.stride + floor**2)  # [S]
+        self.target = self._average(replayer.windows.measured)
+        moved = self._average(np.moveaxis(sensitivity, -1, 0)) / self.scale  # [2 nj, W, nb, S]
+        a = moved.reshape(*moved.shape[:2], -1).transpose(1, 2, 0) * start_sd[:, None]  # [W, m, 2 nj]
+        self.u, s, _ = np.linalg.svd(a, full_matrices=False)
+        self.shrink = 1 - 1 / np.sqrt(1 + s**2)
+
+    def whiten(self, predicted: Array, pick: Index) -> Array:
+        """Predictions [K, W, n, S] -> residuals [K, W, m] of unit variance where the model is right."""
+        y = (self._average(predicted) - self.target[pick]) / self.scale
+        y = y.reshape(*y.shape[:2], -1)
+        u = self.u[pick]
+        return y - np.einsum("wmi,kwi->kwm", u, np.einsum("wmi,kwm->kwi", u, y) * self.shrink[pick])
+
+    def residuals(self, terms: Sequence[Term], points: Sequence[Sequence[Array]], pick: Index) -> Array:
+        """Whitened residuals of one structure at K points, [K, W, m]."""
+        return self.whiten(self.replayer.simulate([change_of(terms, p) for p in points], pick), pick)
+
+    def _average(self, x: Array) -> Array:
+        """Mean over blocks of samples of [..., n, S]."""
+        cut = x[..., : self.blocks * self.stride, :]
+        return cut.reshape(*cut.shape[:-2], self.blocks, self.stride, cut.shape[-1]).mean(-2)
+
+
+def fit(
+    problem: Problem, terms: Sequence[Term], start: Sequence[Array], pick: Index, iterations: int = ITERATIONS
+) -> Fit:
+    """Bounded Levenberg-Marquardt; each iteration tries three dampings in one batch.
+
+    Args:
+        problem: What is minimised.
+        terms: The structure.
+        start: Parameters to start from, one array each term.
+        pick: Windows to fit.
+        iterations: At most.
+    """
+    flat = _Flat(terms)
+    x, damping, r, J = flat.pack(start), 1e-2, None, None
+    if not flat.count:
+        r = problem.residuals(terms, [start], pick)[0]
+        return Fit(tuple(terms), tuple(start), r, np.zeros((*r.shape, 0)))
+    for _ in range(iterations):
+        r, J = _linearise(problem, flat, x, pick)
+        A, g = np.einsum("wmp,wmq->pq", J, J), np.einsum("wmp,wm->p", J, r)
+        tries = [flat.clip(x + _step(A, g, lam, x, flat)) for lam in (damping / 10, damping, damping * 30)]
+        costs = (problem.residuals(terms, [flat.unpack(t) for t in tries], pick) ** 2).mean((1, 2))
+        best = int(np.argmin(costs))
+        before = float(np.mean(r**2))
+        damping = min(max(damping * (0.1, 1.0, 30.0)[best], 1e-8), 1e8)
+        if costs[best] >= before:
+            damping *= 10
+            if damping > 1e4:
+                break
+            continue
+        x = tries[best]
+        J = None
+        if before - costs[best] < TOLERANCE * before:
+            break
+    if J is None:
+        r, J = _linearise(problem, flat, x, pick)
+    assert r is not None
+    return Fit(tuple(terms), tuple(flat.unpack(x)), r, J)
+
+
+def _linearise(problem: Problem, flat: _Flat, x: Array, pick: Index) -> tuple[Array, Array]:
+    steps = flat.steps(x)
+    points = [x, *(x + steps[i] * np.eye(flat.count)[i] for i in range(flat.count))]
+    all_r = problem.residuals(flat.terms, [flat.unpack(p) for p in points], pick)
+    return all_r[0], np.moveaxis((all_r[1:] - all_r[0]) / steps[:, None, None], 0, -1)
+
+
+def _step(A: Array, g: Array, damping: float, x: Array, flat: _Flat) -> Array:
+    """Damped Gauss-Newton step with the parameters that push against a bound held."""
+    free = ~(((x <= flat.low) & (g > 0)) | ((x >= flat.high) & (g < 0)))
+    step = np.zeros(flat.count)
+    if free.any():
+        sub = A[np.ix_(free, free)]
+        diagonal = np.diag(sub)
+        sub = sub + np.diag(damping * diagonal + 1e-9 * max(float(diagonal.max()), 1e-30))
+        step[free] = -np.linalg.solve(sub, g[free])
+    return step
+
+
+class _Flat:
+    """Parameters of a structure as one vector, in typical sizes."""
+
+    def __init__(self, terms: Sequence[Term]):
+        self.terms = tuple(terms)
+        none = np.zeros(0)
+        self.size = np.concatenate([none, *(t.size for t in terms)])
+        self.low = np.concatenate([none, *(t.low for t in terms)]) / self.size
+        self.high = np.concatenate([none, *(t.high for t in terms)]) / self.size
+        self.count = len(self.size)
+
+    def pack(self, values: Sequence[Array]) -> Array:
+        return self.clip(np.concatenate([np.zeros(0), *values]) / self.size)
+
+    def unpack(self, x: Array) -> list[Array]:
+        cuts = np.cumsum([len(t.size) for t in self.terms])[:-1]
+        return np.split(np.clip(x * self.size, self.low * self.size, self.high * self.size), cuts)
+
+    def clip(self, x: Array) -> Array:
+        return np.clip(x, self.low, self.high)
+
+    def steps(self, x: Array) -> Array:
+        """Finite-difference steps that stay inside the bounds."""
+        return np.where(x + STEP > self.high, -STEP, STEP)
+
+
+def window_errors(problem: Problem, f: Fit, pick: Index) -> Array:
+    """Mean whitened square of a fitted structure on windows that it may not have seen, [W]."""
+    return (problem.residuals(f.terms, [f.values], pick)[0] ** 2).mean(1)
+
+
+def left_out_errors(f: Fit, blocks: Index) -> Array:
+    """Error of each fitted window when its block is left out of the fit, to first order, [W].
+
+    Args:
+        f: The fit.
+        blocks: Block of each fitted window, [W].
+    """
+    count = f.J.shape[-1]
+    if not count:
+        return (f.r**2).mean(1)
+    per = np.einsum("wmp,wmq->wpq", f.J, f.J)
+    total, out = per.sum(0), np.empty(len(f.r))
+    ridge = 1e-9 * np.eye(count) * max(float(np.trace(total)) / count, 1e-30)
+    for b in np.unique(blocks):
+        mine = blocks == b
+        rest = total - per[mine].sum(0) + ridge
+        moved = np.linalg.solve(rest, np.einsum("wmp,wm->p", f.J[mine], f.r[mine]))
+        out[mine] = ((f.r[mine] + f.J[mine] @ moved) ** 2).mean(1)
+    return out

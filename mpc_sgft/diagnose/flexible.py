@@ -1,0 +1,122 @@
+"""A residual model without a name: smooth random features of position, speed and command as an unknown joint force.
+
+The force of each feature is taken along the recorded motion and simulated; to first order the predictions are linear
+in the features' weights, so the fit is a ridge regression on the simulation error.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from mpc_sgft.diagnose.fit import change_of
+from mpc_sgft.diagnose.prepare import Setup
+from mpc_sgft.diagnose.record import Array, Index
+from mpc_sgft.diagnose.search import Entry
+from mpc_sgft.diagnose.table import Scales
+
+FEATURES = 32  # per driven or moving joint
+PUSH = 0.01  # of the typical force, to differentiate
+RIDGES = np.logspace(-6, 3, 10)
+
+
+class Flexible(NamedTuple):
+    """A fitted residual model.
+
+    Attributes:
+        errors: Of every window when its block is left out, [W fitted + W held].
+        weights: Of the features, in PUSH times the typical force of their joint.
+        ridge: Regularisation that left-out blocks prefer.
+    """
+
+    errors: Array
+    weights: Array
+    ridge: float
+
+    @property
+    def error(self) -> float:
+        return float(self.errors.mean())
+
+
+def flexible_fit(setup: Setup, best: Entry, scales: dict[str, Scales], rng: np.random.Generator) -> Flexible:
+    """Fit features on top of a set of effects, whose parameters move along (to first order)."""
+    problem, replayer = setup.problem, setup.problem.replayer
+    pick = np.concatenate([setup.fitted, setup.held])
+    features = _features(setup, scales, rng)  # [F, W, N, nj]
+    change = change_of(best.fit.terms, best.fit.values)
+    r0 = problem.residuals(best.fit.terms, [best.fit.values], pick)[0]
+    response = np.stack(
+        [
+            (problem.whiten(replayer.simulate([change], pick, force=f[None, pick]), pick)[0] - r0) / PUSH
+            for f in features
+        ],
+        -1,
+    )  # [W, m, F]
+    fitted = np.arange(len(setup.fitted))
+    J = best.fit.J
+    J_all = response if not J.shape[-1] else response
+    own = np.concatenate([J, np.zeros((len(setup.held), *J.shape[1:]))]) if J.shape[-1] else np.zeros((*r0.shape, 0))
+    X = np.concatenate([J_all, own], -1)
+    free = np.r_[np.ones(J_all.shape[-1]), np.full(own.shape[-1], 1e-6)]
+    norm = np.sqrt((X[fitted] ** 2).mean((0, 1))) + 1e-12
+    X = X / norm
+    choices = [
+        (_left_out(X[fitted], r0[fitted], setup.blocks, lam * free * len(fitted) * r0.shape[1]), lam) for lam in RIDGES
+    ]
+    errors, lam = min(choices, key=lambda c: float(c[0].mean()))
+    w = _solve(X[fitted], r0[fitted], lam * free * len(fitted) * r0.shape[1])
+    held = X[len(fitted) :, :, : J_all.shape[-1]] @ w[: J_all.shape[-1]]
+    held_errors = ((r0[len(fitted) :] + held) ** 2).mean(1)
+    return Flexible(np.concatenate([errors, held_errors]), (w / norm)[: J_all.shape[-1]], lam)
+
+
+def _features(setup: Setup, scales: dict[str, Scales], rng: np.random.Generator) -> Array:
+    """Forces of all features along the recorded motion, in N or N m times PUSH, [F, W, N, nj]."""
+    replayer = setup.problem.replayer
+    w, joints = replayer.windows, replayer.plant.joints
+    times = replayer.step_times()
+    q, v = np.empty((2, *times.shape, len(joints)))
+    u = np.empty((*times.shape, len(replayer.plant.actuators)))
+    for i, s in enumerate(replayer.smooth):
+        mine = np.flatnonzero(w.episode == i)
+        rows = np.clip(np.round(times[mine] / replayer.dt).astype(int), 0, len(s.q) - 1)
+        q[mine], v[mine], u[mine] = s.q[rows], s.v[rows], replayer.episodes[i].ctrl[rows]
+    out = []
+    for j, name in enumerate(joints):
+        at = scales[name]
+        force = PUSH * at.force
+        x = np.stack([(q[..., j] - at.centre) / at.travel, v[..., j] / at.speed], -1)
+        for k in range(FEATURES):
+            spread = rng.choice([0.5, 1.0, 3.0, 8.0])
+            direction = rng.normal(size=2) * (spread, min(spread, 3.0))
+            if k % 4 == 0:
+                direction[1] = 0.0  # position alone: cogging, springs
+            f = np.cos(x @ direction + rng.uniform(0, 2 * np.pi))
+            if k % 4 == 1:
+                f = np.cos(x[..., 0] * direction[0] + rng.uniform(0, 2 * np.pi)) * np.tanh(3 * x[..., 1])
+            column = np.zeros((*times.shape, len(joints)))
+            column[..., j] = force * f
+            out.append(column)
+        for f in (np.tanh(10 * x[..., 1]), x[..., 1], np.tanh(x[..., 1])):
+            column = np.zeros((*times.shape, len(joints)))
+            column[..., j] = force * f
+            out.append(column)
+    return np.array(out)
+
+
+def _solve(X: Array, r: Array, ridge: Array) -> Array:
+    A = np.einsum("wmp,wmq->pq", X, X) + np.diag(ridge)
+    return -np.linalg.solve(A, np.einsum("wmp,wm->p", X, r))
+
+
+def _left_out(X: Array, r: Array, blocks: Index, ridge: Array) -> Array:
+    """Error of each window when its block is left out of the ridge regression, [W]."""
+    A = np.einsum("wmp,wmq->wpq", X, X)
+    g = np.einsum("wmp,wm->wp", X, r)
+    total_A, total_g, out = A.sum(0) + np.diag(ridge), g.sum(0), np.empty(len(r))
+    for b in np.unique(blocks):
+        mine = blocks == b
+        w = -np.linalg.solve(total_A - A[mine].sum(0), total_g - g[mine].sum(0))
+        out[mine] = ((r[mine] + X[mine] @ w) ** 2).mean(1)
+    return out

@@ -1,0 +1,70 @@
+"""Is one structure credibly better than another? Errors per window, compared in pairs, resampled by windows."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy import stats
+
+from mpc_sgft.diagnose.record import Array
+
+RESAMPLES = 1000
+GAIN_LEVEL = 0.98  # a larger structure must be better with this confidence ...
+TIE_LEVEL = 0.90  # ... while a rival of the same size must be worse with this one, or it ties
+MIN_SHARE = 0.005  # of the error: a gain below is not worth a name
+MIN_GAIN = 0.02  # in units of the noise's variance
+
+
+class Interval(NamedTuple):
+    mean: float
+    low: float
+    high: float
+
+
+def gain(worse: Array, better: Array, level: float, rng: np.random.Generator) -> Interval:
+    """Mean drop of the error from one structure to another with its interval (two-sided `level`).
+
+    The wider of Student's and the bootstrap's interval: the one knows that windows are few, the other that they are
+    not normal.
+
+    Args:
+        worse, better: Errors of the same windows, [W].
+    """
+    d = worse - better
+    mean = float(d.mean())
+    if len(d) < 2 or np.ptp(d) == 0:
+        return Interval(mean, mean, mean)
+    half = float(stats.t.ppf(0.5 + level / 2, len(d) - 1) * d.std(ddof=1) / np.sqrt(len(d)))
+    means = d[rng.integers(0, len(d), (RESAMPLES, len(d)))].mean(1)
+    low, high = np.quantile(means, [0.5 - level / 2, 0.5 + level / 2])
+    return Interval(mean, min(float(low), mean - half), max(float(high), mean + half))
+
+
+def credible(worse: Array, better: Array, rng: np.random.Generator, level: float = GAIN_LEVEL) -> bool:
+    """Whether the gain is real, and large enough to matter."""
+    g = gain(worse, better, 2 * level - 1, rng)
+    return g.low > 0 and g.mean > max(MIN_SHARE * float(worse.mean()), MIN_GAIN)
+
+
+def worse(rival: Array, best: Array, rng: np.random.Generator) -> bool:
+    """Whether a rival of the same size can be ruled out."""
+    return gain(rival, best, 2 * TIE_LEVEL - 1, rng).low > 0
+
+
+def win_shares(errors: Array, complexity: Array, rng: np.random.Generator, points: int) -> Array:
+    """How often each structure has the lowest penalised error when windows are resampled, [M].
+
+    The penalty is that of BIC, with the best structure's error as the variance.
+
+    Args:
+        errors: [M, W].
+        complexity: Parameters of each, [M].
+        points: Residuals per window.
+    """
+    count = errors.shape[1]
+    best = float(errors.mean(1).min())
+    penalty = best * complexity * np.log(count * points) / (count * points)
+    picks = rng.integers(0, count, (RESAMPLES, count))
+    means = errors[:, picks].mean(2) + penalty[:, None]
+    return np.bincount(means.argmin(0), minlength=len(errors)) / RESAMPLES

@@ -1,0 +1,198 @@
+"""What diagnose must know of each effect: where it can sit, how large it may be, and where a fit should start.
+
+The physics is in envs/effects/<name>.py. A new effect needs one row in TABLE. Commands are changed before the windows
+are cut, so that delays and lags reach back before a window's start.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from functools import partial
+from importlib import import_module
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from envs.effects.base import Effect, available, load
+from mpc_sgft.diagnose.plant import Change, Plant, joint_of
+from mpc_sgft.diagnose.record import Array
+from mpc_sgft.diagnose.signals import SIGNALS
+from mpc_sgft.diagnose.table import INCLUDES, TABLE, Scales
+from mpc_sgft.errors import unknown
+
+HIDDEN = ("velocity", "rest")  # parameters that mean nothing while the effect is neutral
+LONG = (int(mujoco.mjtGeom.mjGEOM_CAPSULE), int(mujoco.mjtGeom.mjGEOM_CYLINDER))
+
+
+@dataclass(frozen=True)
+class Term:
+    """An effect at a place, with free parameters.
+
+    Attributes:
+        effect: Name in envs/effects/, or "nominal" for a nominal quantity that is refitted.
+        at: Joints, actuators or bodies.
+        names, units: Of the parameters.
+        neutral, low, high, size: Arrays [p]: without effect, bounds, typical size.
+        starts: Where fits start, each [p].
+        build: values [p] -> what they change.
+        fixed: Parameters that are set and not fitted.
+    """
+
+    effect: str
+    at: tuple[str, ...]
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    neutral: Array
+    low: Array
+    high: Array
+    size: Array
+    starts: tuple[Array, ...]
+    build: Callable[[Array], Change]
+    fixed: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def label(self) -> str:
+        return f"{self.effect}@{','.join(self.at)}" if self.at else self.effect
+
+
+def candidates(plant: Plant, scales: Mapping[str, Scales], effects: Sequence[str] | None) -> list[Term]:
+    """Every effect that the data may show, at every place it may sit.
+
+    Args:
+        plant: The nominal scene.
+        scales: Joint, actuator or body -> typical sizes there.
+        effects: Restrict to these; None for the whole table.
+
+    Raises:
+        UserError: For an effect that does not exist or that this kind of data cannot show.
+    """
+    possible = [name for name in TABLE if name in available()]
+    for name in effects or []:
+        if name not in possible:
+            raise unknown("effect", name, possible, "--effects")
+    places = {
+        "joint": plant.joints,
+        "actuator": plant.actuators,
+        "body": plant.bodies,
+        "signal": [f"qpos/{j}" for j in plant.joints],
+        "": [""],
+    }
+    driven = [j for a in plant.actuators if (j := joint_of(plant, a))]
+    built = []
+    for name in (n for n in possible if effects is None or n in effects):
+        for place in driven if TABLE[name].driven else places[kind_of(name).place]:
+            variants = load_positions(plant, place) if name == "payload" else [{}]
+            built += [make_term(plant, name, place, scales.get(place, Scales()), fixed) for fixed in variants]
+    return built
+
+
+def load_positions(plant: Plant, body: str) -> list[dict[str, Any]]:
+    """Where a load may sit on a body: its centre of mass, and its far end where that is elsewhere."""
+    m = plant.model
+    i = m.body(body).id
+    centre = np.array(m.body_ipos[i])
+    ends = [centre]
+    for g in range(m.body_geomadr[i], m.body_geomadr[i] + m.body_geomnum[i]):
+        axis = np.zeros(9)
+        mujoco.mju_quat2Mat(axis, m.geom_quat[g])
+        long = m.geom_size[g, 1] if m.geom_type[g] in LONG else 0.0
+        ends += [m.geom_pos[g] + sign * long * axis[2::3] for sign in (-1, 1)]
+    far = max(ends, key=lambda p: float(np.linalg.norm(p)))
+    points = [centre, far] if np.linalg.norm(far - centre) > 0.05 * np.linalg.norm(far) + 1e-9 else [centre]
+    joint = m.body_jntadr[i]
+    if joint >= 0 and m.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE:
+        points = points[:1]  # where on a carriage does not matter
+    return [{"position": [round(float(x), 6) for x in p]} for p in points]
+
+
+def kind_of(name: str) -> type[Effect]:
+    return import_module(f"envs.effects.{name}").EFFECT
+
+
+def make_term(plant: Plant, name: str, place: str, scales: Scales, fixed: Mapping[str, Any] | None = None) -> Term:
+    """One effect at one place ("" for the whole scene)."""
+    kind, parameters = kind_of(name), TABLE[name].parameters
+    pars = list(parameters.values())
+    sizes = np.array([par.size(scales) for par in pars])
+    neutral = np.array([par.neutral(scales) if callable(par.neutral) else par.neutral for par in pars])
+    hard = np.array([kind.bounds.get(p, (-np.inf, np.inf)) for p in parameters]).reshape(-1, 2)
+    soft = np.array([(neutral[i] + par.low * sizes[i], neutral[i] + par.high * sizes[i]) for i, par in enumerate(pars)])
+    low, high = np.maximum(hard[:, 0], soft[:, 0]), np.minimum(hard[:, 1], soft[:, 1])
+    starts = [
+        np.array([par.starts[k % len(par.starts)] for par in pars]) for k in range(max(len(p.starts) for p in pars))
+    ]
+    at = (place,) if place else ()
+    return Term(
+        effect=name,
+        at=at,
+        names=tuple(parameters),
+        units=tuple(kind.units.get(p, kind.units.get(next(iter(parameters)), "1")) for p in parameters),
+        neutral=neutral,
+        low=low,
+        high=high,
+        size=sizes,
+        starts=tuple(np.clip(neutral + s * sizes, low, high) for s in starts),
+        build=partial(_change, plant, name, at, tuple(parameters), fixed or {}),
+        fixed=fixed or {},
+    )
+
+
+def settings(term: Term, value: Array) -> dict[str, Any]:
+    """What effects.yaml says of one effect."""
+    return {**numbers(term.effect, term.names, value), **term.fixed, **({"at": list(term.at)} if term.at else {})}
+
+
+def numbers(effect: str, names: Sequence[str], x: Array) -> dict[str, float]:
+    """The effect's own parameters from the fitted ones."""
+    fitted = dict(zip(names, map(float, x), strict=True))
+    sums = TABLE[effect].sums if effect in TABLE else {}
+    inner = (
+        {part for parts in sums.values() for part in parts} - set(f.name for f in fields(kind_of(effect)))
+        if sums
+        else set()
+    )
+    return {k: v for k, v in fitted.items() if k not in inner} | {
+        k: fitted[a] + fitted[b] for k, (a, b) in sums.items()
+    }
+
+
+def _change(
+    plant: Plant, name: str, at: tuple[str, ...], names: tuple[str, ...], fixed: Mapping[str, Any], x: Array
+) -> Change:
+    values = numbers(name, names, x)
+    if name in SIGNALS:
+        return SIGNALS[name](plant, at, values)
+    effect = load({name: {**values, **fixed, **({"at": list(at)} if at else {})}})[0]
+    kind = type(effect)
+    joints, actuators = plant.joints, plant.actuators
+    return Change(
+        edits=(effect.edit_spec,) if kind.edit_spec is not Effect.edit_spec else (),
+        commands=(lambda ctrl, dt: effect.ctrl(ctrl, actuators),) if kind.ctrl is not Effect.ctrl else (),
+        frictions=(lambda load: _level(effect, load, joints),) if kind.friction is not Effect.friction else (),
+        reads=(lambda x, name: effect.measured(x, name, np.zeros(len(x))),)
+        if kind.measured is not Effect.measured
+        else (),
+    )
+
+
+def _level(effect: Effect, force: Array, joints: list[str]) -> Array:
+    level = effect.friction(force, joints)
+    assert level is not None, type(effect).__name__
+    return level
+
+
+def includes(rich: Term, simple: Term) -> bool:
+    """Whether one effect can do all that another does at the same place."""
+    return simple.effect in INCLUDES.get(rich.effect, {}) and simple.at == rich.at
+
+
+def enrich(rich: Term, simple: Term, value: Array) -> Array:
+    """The richer effect's parameters that do exactly what the simpler one does."""
+    mapping = INCLUDES[rich.effect][simple.effect]
+    out = np.array([s if n in HIDDEN else z for n, s, z in zip(rich.names, rich.starts[0], rich.neutral, strict=True)])
+    for i, name in enumerate(rich.names):
+        if name in mapping:
+            out[i] = value[simple.names.index(mapping[name])]
+    return np.clip(out, rich.low, rich.high)

@@ -1,0 +1,171 @@
+"""The verdict: an effect, none, unknown, or not identifiable from these data."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy import stats
+
+from mpc_sgft.diagnose import judge
+from mpc_sgft.diagnose.fit import fit
+from mpc_sgft.diagnose.flexible import Flexible
+from mpc_sgft.diagnose.prepare import Setup
+from mpc_sgft.diagnose.record import Array
+from mpc_sgft.diagnose.search import Entry, entry
+from mpc_sgft.diagnose.table import EQUIVALENT, Equivalence
+
+UNEXPLAINED = 0.05  # share of what any model can explain that named effects may miss before the answer is "unknown"
+ABOVE_NOISE = 1.3  # an error below this many times the noise's variance needs no further name
+
+
+class Verdict(NamedTuple):
+    """The answer.
+
+    Attributes:
+        kind: "effect", "none", "unknown" or "not_identifiable".
+        best: The set that is named; the baseline if there is none.
+        ties: Sets of the same size that these data cannot rule out, and why if that is declared.
+        probability: Share of resampled windows in which a set wins, by key.
+        reason: In words.
+    """
+
+    kind: str
+    best: Entry
+    ties: list[tuple[Entry, str]]
+    probability: dict[frozenset[str], float]
+    reason: str
+
+
+def choose(setup: Setup, entries: list[Entry], rng: np.random.Generator) -> Entry:
+    """The smallest set that no larger one credibly beats."""
+    current = entries[0]
+    while True:
+        larger = [e for e in entries if e.complexity > current.complexity and e.error < current.error]
+        better = [e for e in larger if judge.credible(current.errors, e.errors, rng)]
+        if not better:
+            return prune(setup, current, entries, rng)
+        smallest = min(e.complexity for e in better)
+        current = min((e for e in better if e.complexity == smallest), key=lambda e: e.error)
+
+
+def prune(setup: Setup, best: Entry, entries: list[Entry], rng: np.random.Generator) -> Entry:
+    """Leave out effects that are not needed once the others are there; fitted subsets join `entries`."""
+    nominal = len(setup.baseline.terms)
+    for i in range(nominal, len(best.fit.terms)):
+        if best.effects < 2:
+            break
+        keep = [k for k in range(len(best.fit.terms)) if k != i]
+        key = frozenset(best.fit.terms[k].label + str(best.fit.terms[k].fixed) for k in keep if k >= nominal)
+        without = next((e for e in entries if e.key == key), None)
+        if without is None:
+            terms = [best.fit.terms[k] for k in keep]
+            without = entry(setup, fit(setup.problem, terms, [best.fit.values[k] for k in keep], setup.fitted))
+            entries.append(without)
+        if not judge.credible(without.errors, best.errors, rng):
+            return prune(setup, without, entries, rng)
+    return best
+
+
+def judge_entries(setup: Setup, entries: list[Entry], flexible: Flexible | None, rng: np.random.Generator) -> Verdict:
+    """Compare everything that was fitted.
+
+    Args:
+        setup: Problem and baseline.
+        entries: From `search`, baseline first.
+        flexible: Residual model on top of the chosen set; None if it was not fitted.
+        rng: For the bootstrap.
+    """
+    best = choose(setup, entries, rng)
+    probability = dict.fromkeys((e.key for e in entries), 0.0)
+    rivals = [e for e in entries if e.complexity <= max(best.complexity, 1)]  # larger sets are no more credible
+    shares = judge.win_shares(
+        np.array([e.errors for e in rivals]), np.array([e.complexity for e in rivals]), rng, setup.problem.blocks
+    )
+    probability |= {e.key: float(s) for e, s in zip(rivals, shares, strict=True)}
+    declared = [(e, equivalence(best, e)) for e in find_ties(best, entries, rng)]
+    base = entries[0]
+    if flexible is not None and beats(flexible, best, base, rng):
+        missed = (best.error - flexible.error) / max(base.error - flexible.error, 1e-12)
+        reason = f"a flexible residual model explains {missed:.0%} more of the error than {_list(best)}"
+        ties = [(e, "" if q is None else q.reason) for e, q in declared]
+        return Verdict("unknown", best, ties, probability, reason)
+    if not best.effects:
+        reason = "the nominal model's error is within noise and the simulator's floor"
+        if base.error > ABOVE_NOISE:
+            reason = f"no effect gains credibly; the error is {np.sqrt(base.error):.1f} times noise and floor"
+        return Verdict("none", best, [], probability, reason)
+    best, open_ties = canonical(best, declared)
+    named = [(e, "" if q is None else q.reason) for e, q in declared if e is not best]
+    if open_ties:
+        return Verdict("not_identifiable", best, named, probability, f"{_list(best)} and {len(open_ties)} others tie")
+    return Verdict("effect", best, named, probability, f"no larger set is credibly better than {_list(best)}")
+
+
+def find_ties(best: Entry, entries: list[Entry], rng: np.random.Generator) -> list[Entry]:
+    """Sets no larger than the best that are not credibly worse, best first."""
+    rivals = [e for e in entries if e is not best and 0 < e.complexity <= best.complexity and e.effects]
+    return sorted((e for e in rivals if not judge.worse(e.errors, best.errors, rng)), key=lambda e: e.error)
+
+
+def equivalence(a: Entry, b: Entry) -> Equivalence | None:
+    """The declared class in which two sets differ, if that is all they differ in."""
+    only_a = [t.effect for t in a.terms if t.label not in b.names]
+    only_b = [t.effect for t in b.terms if t.label not in a.names]
+    if len(only_a) != 1 or len(only_b) != 1:
+        return None
+    both = {only_a[0], only_b[0]}
+    return next((q for q in EQUIVALENT if both <= q.effects and len(both) == 2), None)
+
+
+def canonical(best: Entry, ties: list[tuple[Entry, Equivalence | None]]) -> tuple[Entry, list[Entry]]:
+    """The set to report, and the ties that no convention resolves."""
+    unresolved = [e for e, q in ties if q is None or q.canonical is None]
+    for e, q in ties:
+        if (
+            q is not None
+            and q.canonical in [t.effect for t in e.terms]
+            and q.canonical not in [t.effect for t in best.terms]
+        ):
+            return e, unresolved
+    return best, unresolved
+
+
+def beats(flexible: Flexible, best: Entry, base: Entry, rng: np.random.Generator) -> bool:
+    """Whether something that no name in the library covers is clearly there."""
+    if best.error < ABOVE_NOISE or not judge.credible(best.errors, flexible.errors, rng):
+        return False
+    return best.error - flexible.error > UNEXPLAINED * (base.error - flexible.error)
+
+
+def intervals(f_entry: Entry, level: float = 0.90) -> list[tuple[Array, Array]]:
+    """Low and high of each effect's parameters: the wider of the model's and the windows' own scatter.
+
+    The first takes residuals as white, the second (a sandwich over windows) lets each window have its own error.
+    """
+    f = f_entry.fit
+    count = f.J.shape[-1]
+    if not count:
+        return []
+    A = np.einsum("wmp,wmq->pq", f.J, f.J)
+    inverse = np.linalg.pinv(A + 1e-12 * np.eye(count) * max(float(np.trace(A)), 1e-30))
+    white = np.diag(inverse) * max(1.0, f.cost)
+    scores = np.einsum("wmp,wm->wp", f.J, f.r)
+    windows = np.diag(inverse @ (scores.T @ scores) @ inverse)
+    sd = np.sqrt(np.maximum(white, windows)) * float(stats.t.ppf(0.5 + level / 2, max(len(f.r) - 1, 1)))
+    out, at = [], 0
+    for term, value in zip(f.terms, f.values, strict=True):
+        half = sd[at : at + len(value)] * term.size
+        out.append((np.maximum(value - half, term.low), np.minimum(value + half, term.high)))
+        at += len(value)
+    return out[len(f.terms) - f_entry.effects :]
+
+
+def _list(e: Entry) -> str:
+    return " + ".join(e.names) or "the nominal model"
+
+
+def effect_probability(best: Entry, entries: Sequence[Entry], probability: dict[frozenset[str], float]) -> list[float]:
+    """Share of resamples whose winner contains each effect of the chosen set."""
+    return [sum(probability[e.key] for e in entries if t.label in e.names) for t in best.terms]

@@ -1,0 +1,175 @@
+"""The nominal model, and what one simulation of it with changed physics needs."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from mpc_sgft.diagnose.record import Array, Index
+from mpc_sgft.errors import UserError
+
+FORCE = "diagnose/force/"  # sensors that are added for the comparison
+SCALAR = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
+
+
+@dataclass(frozen=True)
+class Change:
+    """What a set of effects changes in one simulation.
+
+    Attributes:
+        edits: Applied to a copy of the scene, in order.
+        commands: f(ctrl [T, nu], dt) -> [T, nu], applied to the recorded commands, in order.
+        delay: Seconds by which each actuator's command is late, [nu] or a number.
+        frictions: f(load [M, nj]) -> level of dry friction [M, nj], applied along the recorded motion.
+        reads: f(true signal [M], name) -> what is read of it; affine.
+    """
+
+    edits: tuple[Callable[[mujoco.MjSpec], None], ...] = ()
+    commands: tuple[Callable[[Array, float], Array], ...] = ()
+    delay: Array | float = 0.0
+    frictions: tuple[Callable[[Array], Array], ...] = ()
+    reads: tuple[Callable[[Array, str], Array], ...] = ()
+
+    def __add__(self, other: Change) -> Change:
+        return Change(
+            self.edits + other.edits,
+            self.commands + other.commands,
+            self.delay + other.delay,
+            self.frictions + other.frictions,
+            self.reads + other.reads,
+        )
+
+    def read(self, values: Array, name: str) -> Array:
+        for read in self.reads:
+            values = read(values, name)
+        return values
+
+    def unread(self, values: Array, name: str) -> Array:
+        """The true signal behind a reading: the reads are affine."""
+        if not self.reads:
+            return values
+        zero, one = self.read(np.array([0.0, 1.0]), name)
+        return (values - zero) / (one - zero)
+
+
+@dataclass
+class Plant:
+    """A scene whose moving joints are all hinges and slides.
+
+    Attributes:
+        spec: The nominal scene; never changed, only copied.
+        model: Compiled from it.
+        joints: Names in the model's order.
+        actuators: Names in the model's order.
+    """
+
+    spec: mujoco.MjSpec
+    model: mujoco.MjModel = field(init=False)
+    joints: list[str] = field(init=False)
+    actuators: list[str] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.spec = self.spec.copy()
+        _name_all(self.spec)
+        there = {sensor.name for sensor in self.spec.sensors}
+        for actuator in self.spec.actuators:  # so that a measured force can be compared
+            if f"{FORCE}{actuator.name}" in there:
+                continue
+            self.spec.add_sensor(
+                name=f"{FORCE}{actuator.name}",
+                type=mujoco.mjtSensor.mjSENS_ACTUATORFRC,
+                objtype=mujoco.mjtObj.mjOBJ_ACTUATOR,
+                objname=actuator.name,
+            )
+        self.model = self.spec.compile()
+        if not self.model.nu or not self.model.nv:
+            raise UserError("the model has no actuator or no joint: there is nothing to compare with measurements.")
+        if any(t not in SCALAR for t in self.model.jnt_type):
+            free = [self.model.joint(i).name for i in range(self.model.njnt) if self.model.jnt_type[i] not in SCALAR]
+            raise UserError(f"joint {free[0]!r} is free or a ball: only hinges and slides can be compared with --data.")
+        self.joints = [self.model.joint(i).name for i in range(self.model.njnt)]
+        self.actuators = [self.model.actuator(i).name for i in range(self.model.nu)]
+
+    @property
+    def bodies(self) -> list[str]:
+        """Bodies that move and have a mass."""
+        m = self.model
+        return [m.body(i).name for i in range(1, m.nbody) if m.body_weldid[i] and m.body_mass[i] > 0]
+
+    def ranges(self) -> dict[str, tuple[float, float]]:
+        """Joint -> limits, infinite where the model has none."""
+        m = self.model
+        return {
+            name: tuple(m.jnt_range[i]) if m.jnt_limited[i] else (-np.inf, np.inf) for i, name in enumerate(self.joints)
+        }
+
+    def compile(self, change: Change) -> mujoco.MjModel:
+        """The scene with the changes in it."""
+        if not change.edits:
+            return self.model
+        spec = self.spec.copy()
+        for edit in change.edits:
+            edit(spec)
+        return spec.compile()
+
+    def addresses(self, model: mujoco.MjModel) -> tuple[Index, Index]:
+        """Where the measured joints are in qpos and qvel of a (changed) model."""
+        ids = [model.joint(name).id for name in self.joints]
+        return model.jnt_qposadr[ids], model.jnt_dofadr[ids]
+
+
+def load_plant(model: str | Path | mujoco.MjModel | mujoco.MjSpec) -> Plant:
+    """A plant from an MJCF file, a spec or the model that was compiled last.
+
+    Raises:
+        UserError: If the file is absent or does not load, or the scene cannot be diagnosed.
+    """
+    if isinstance(model, mujoco.MjSpec):
+        return Plant(model)
+    try:
+        if isinstance(model, mujoco.MjModel):
+            return Plant(_decompile(model))
+        path = Path(model)
+        if not path.is_file():
+            raise UserError(f"{path}: no such model file. Give an MJCF scene (--model scene.xml).")
+        spec = mujoco.MjSpec.from_file(str(path))
+        for kind in ("meshdir", "texturedir"):  # so that a repaired scene elsewhere finds its files
+            setattr(spec, kind, str((path.parent / (getattr(spec, kind) or "")).resolve()))
+        return Plant(spec)
+    except ValueError as error:
+        raise UserError(f"{model}: MuJoCo cannot load this scene: {error}") from error
+
+
+def _decompile(model: mujoco.MjModel) -> mujoco.MjSpec:
+    with tempfile.TemporaryDirectory() as folder:
+        path = f"{folder}/model.xml"
+        try:
+            mujoco.mj_saveLastXML(path, model)
+            spec = mujoco.MjSpec.from_file(path)
+            same = spec.copy().compile()
+        except (mujoco.FatalError, ValueError) as error:
+            raise UserError(f"this MjModel cannot be turned into MJCF ({error}); pass its file or MjSpec.") from error
+    if (same.nq, same.nu, same.nbody) != (model.nq, model.nu, model.nbody):
+        raise UserError("this MjModel is not the one that was compiled last; pass its file or MjSpec instead.")
+    return spec
+
+
+def _name_all(spec: mujoco.MjSpec) -> None:
+    """Effects sit at names: give one to what has none."""
+    for kind, elements in (("joint", spec.joints), ("actuator", spec.actuators), ("body", spec.bodies)):
+        for i, element in enumerate(elements):
+            if not element.name:
+                element.name = f"{kind}{i}"
+
+
+def joint_of(plant: Plant, actuator: str) -> str | None:
+    """The joint that an actuator drives, None if it drives something else."""
+    m = plant.model
+    i = m.actuator(actuator).id
+    kinds: Sequence[int] = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+    return m.joint(m.actuator_trnid[i, 0]).name if m.actuator_trntype[i] in [int(k) for k in kinds] else None

@@ -1,0 +1,176 @@
+"""Everything that is known before any candidate: windows, noise, the simulator's floor, typical sizes, the split."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from mpc_sgft.diagnose.fit import Fit, Problem, change_of, fit
+from mpc_sgft.diagnose.library import Term
+from mpc_sgft.diagnose.plant import Plant, joint_of
+from mpc_sgft.diagnose.record import Array, Episode, Index
+from mpc_sgft.diagnose.replay import Replayer
+from mpc_sgft.diagnose.smooth import noise_of
+from mpc_sgft.diagnose.table import Scales
+from mpc_sgft.errors import UserError
+
+WINDOW = 0.5  # [s] where the data allow it
+MIN_WINDOWS = 16  # shorter windows rather than fewer
+BLOCKS = 8  # into which the fitted windows are split for leaving out
+KICK = 1e-4  # of the typical size, to differentiate by the start
+
+
+@dataclass(frozen=True)
+class Setup:
+    """A problem with its baseline.
+
+    Attributes:
+        problem: Residuals of structures.
+        fitted, held: Windows to fit to, and windows never fitted.
+        blocks: Contiguous block of each fitted window.
+        baseline: The nominal model with uncertain quantities refitted.
+        noise, floor: Of each signal, of the sensor and of the simulator, [S].
+    """
+
+    problem: Problem
+    fitted: Index
+    held: Index
+    blocks: Index
+    baseline: Fit
+    noise: Array
+    floor: Array
+
+
+def default_window(episodes: Sequence[Episode]) -> float:
+    """0.5 s, or less if there would be fewer than sixteen windows, but at least ten samples."""
+    total = sum(e.seconds for e in episodes)
+    return max(min(WINDOW, total / MIN_WINDOWS), 10 * episodes[0].dt)
+
+
+def default_signals(episodes: Sequence[Episode], plant: Plant) -> list[str]:
+    """Positions, and measured actuator forces: both are independent witnesses. Velocities only start the windows."""
+    has = episodes[0].signals
+    return [n for n in has if n.startswith("qpos/")] + [n for n in has if n.startswith("force/")]
+
+
+def prepare(
+    plant: Plant,
+    episodes: Sequence[Episode],
+    nominal: Sequence[Term],
+    *,
+    window: float | None,
+    signals: Sequence[str] | None,
+    held_out: float | Sequence[str] | None,
+) -> Setup:
+    """Cut windows, measure noise and floor, and refit the nominal quantities."""
+    chosen = list(signals or default_signals(episodes, plant))
+    missing = [s for s in chosen if any(s not in e.signals for e in episodes)]
+    if missing:
+        raise UserError(f"signal {missing[0]!r} is not in every episode. There are: {', '.join(episodes[0].signals)}.")
+    replayer = Replayer(plant, episodes, window or default_window(episodes), chosen)
+    if len(replayer.windows.start) < 4:
+        raise UserError(f"only {len(replayer.windows.start)} windows: give more data or a shorter --window.")
+    fitted, held = split(replayer, held_out)
+    noise = np.array([np.median([noise_of(e.signals[s]) for e in episodes]) for s in chosen])
+    first = _problem(replayer, noise, np.zeros(len(chosen)), [], [])
+    base = fit(first, nominal, [t.neutral for t in nominal], fitted)
+    floor = simulator_floor(plant, episodes, replayer, nominal, base.values)
+    problem = _problem(replayer, noise, floor, nominal, base.values)
+    base = fit(problem, nominal, base.values, fitted)
+    blocks = np.minimum(np.arange(len(fitted)) * BLOCKS // len(fitted), BLOCKS - 1)
+    return Setup(problem, fitted, held, blocks, base, noise, floor)
+
+
+def split(replayer: Replayer, held_out: float | Sequence[str] | None) -> tuple[Index, Index]:
+    """Windows to fit and windows to hold out: whole episodes, or the end of the only one.
+
+    Raises:
+        UserError: If a named episode does not exist or one side would be empty.
+    """
+    w, names = replayer.windows, [e.name for e in replayer.episodes]
+    everything = np.arange(len(w.start))
+    if held_out is not None and not isinstance(held_out, int | float):
+        wrong = [n for n in held_out if n not in names]
+        if wrong:
+            raise UserError(f"held-out episode {wrong[0]!r} is not in the data. There are: {', '.join(names)}.")
+        apart = np.isin(w.episode, [names.index(n) for n in held_out])
+    else:
+        share = 0.25 if held_out is None else float(held_out)
+        if not 0 < share < 1:
+            raise UserError(f"held-out share {share}: allowed are numbers between 0 and 1, or episode names.")
+        if len(names) >= 4:
+            apart = w.episode >= len(names) - max(1, round(share * len(names)))
+        else:
+            apart = np.zeros(len(everything), bool)
+            for i in range(len(names)):  # the end of each, so that every motion is on both sides
+                mine = np.flatnonzero(w.episode == i)
+                apart[mine[len(mine) - max(1, round(share * len(mine))) :]] = len(mine) > 1
+    if apart.all() or not apart.any():
+        raise UserError("the split leaves nothing to fit or nothing to hold out; change --held-out.")
+    return everything[~apart], everything[apart]
+
+
+def simulator_floor(
+    plant: Plant, episodes: Sequence[Episode], replayer: Replayer, terms: Sequence[Term], values: Sequence[Array]
+) -> Array:
+    """Root mean square of what half the time step changes, a third more for what is left below that, [S]."""
+    spec = plant.spec.copy()
+    spec.option.timestep = plant.model.opt.timestep / 2
+    w = replayer.windows
+    finer = Replayer(Plant(spec), episodes, w.samples * replayer.dt, replayer.signals)
+    change = change_of(terms, values)
+    difference = finer.simulate([change])[0] - replayer.simulate([change])[0]
+    return np.sqrt(np.median((difference**2).mean(1), 0)) * 4 / 3
+
+
+def _problem(replayer: Replayer, noise: Array, floor: Array, terms: Sequence[Term], values: Sequence[Array]) -> Problem:
+    w = replayer.windows
+    sd = np.array([np.concatenate([replayer.smooth[i].q_sd, replayer.smooth[i].v_sd]) for i in w.episode])
+    speed = np.sqrt(np.mean(w.v0**2, 0)) + 1e-6
+    travel = np.ptp(w.q0, axis=0) + 1e-6
+    kick = KICK * np.concatenate([travel, speed])
+    change = change_of(terms, values)
+    shifts = np.concatenate([np.diag(kick), -np.diag(kick)])
+    y = replayer.simulate([change] * len(shifts), shift=shifts)
+    half = len(kick)
+    sensitivity = np.moveaxis((y[:half] - y[half:]) / (2 * kick[:, None, None, None]), 0, -1)
+    return Problem(replayer, noise, floor, sd, sensitivity)
+
+
+def scales(plant: Plant, replayer: Replayer) -> dict[str, Scales]:
+    """Typical sizes at every joint, actuator and body, from the measured motion."""
+    m = plant.model
+    data = mujoco.MjData(m)
+    q = np.concatenate([s.q for s in replayer.smooth])
+    v = np.concatenate([s.v for s in replayer.smooth])
+    a = np.concatenate([s.a for s in replayer.smooth])
+    u = np.concatenate([e.ctrl for e in replayer.episodes])
+    pick = np.linspace(0, len(q) - 1, min(200, len(q))).astype(int)
+    forces, inertias, peak = [], [], np.zeros(m.nu)
+    for k in pick:
+        data.qpos[:], data.qvel[:], data.ctrl[:] = q[k], v[k], u[k]
+        mujoco.mj_forward(m, data)
+        full = np.zeros((m.nv, m.nv))
+        mujoco.mj_fullM(m, data, full)
+        inertias.append(np.diag(full))
+        forces.append(np.abs(full @ a[k]) + np.abs(data.qfrc_bias) + np.abs(data.qfrc_actuator))
+        peak = np.maximum(peak, np.abs(data.actuator_force))
+    force = np.sqrt(np.mean(np.square(forces), 0)) + 1e-9
+    inertia = np.mean(inertias, 0)
+    speed, travel = np.sqrt(np.mean(v**2, 0)) + 1e-6, np.std(q, 0) + 1e-6
+    dt, out = replayer.dt, {}
+    for i, joint in enumerate(plant.joints):
+        middle = float(np.median(q[:, i]))
+        at = Scales(float(force[i]), float(speed[i]), float(travel[i]), middle, float(inertia[i]), dt=dt)
+        out[joint] = out[f"qpos/{joint}"] = at
+    for i, name in enumerate(plant.actuators):
+        joint = joint_of(plant, name)
+        at = out[joint] if joint else Scales(dt=dt)
+        command = float(np.sqrt(np.mean(u[:, i] ** 2))) + 1e-9
+        out[name] = at._replace(command=command, peak=float(peak[i]) + 1e-9)
+    for name in plant.bodies:
+        out[name] = Scales(mass=float(m.body_mass[m.body(name).id]), dt=dt)
+    return out

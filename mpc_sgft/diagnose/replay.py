@@ -1,0 +1,280 @@
+"""Short windows of the measurement, simulated from their measured starts under the measured commands.
+
+Semi-implicit Euler is a leapfrog whose velocities live half a step earlier: windows start with v(t0 - h/2), and each
+step gets the mean of the command over the half steps around it. This makes the simulator's own error second order.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import mujoco
+import mujoco.rollout
+import numpy as np
+from numpy.typing import NDArray
+
+from envs.effects import place_rotors
+from mpc_sgft.diagnose.plant import FORCE, Change, Plant
+from mpc_sgft.diagnose.record import Array, Episode, Index
+from mpc_sgft.diagnose.smooth import smooth
+
+FULL = mujoco.mjtState.mjSTATE_FULLPHYSICS
+CTRL = int(mujoco.mjtState.mjSTATE_CTRL)
+FORCED = CTRL | int(mujoco.mjtState.mjSTATE_QFRC_APPLIED)
+EXPLODED = 1e6  # predictions are clipped here, so that an unstable candidate is bad, not infinite
+
+
+class Windows(NamedTuple):
+    """W windows of n + 1 samples.
+
+    Attributes:
+        episode: Index of each window's episode, [W].
+        start: Index of its first sample, [W].
+        samples: n, predicted samples after the start.
+        measured: Signals at these samples, [W, n, S].
+        q0, v0, a0: Measured start of each joint, [W, nj].
+    """
+
+    episode: Index
+    start: Index
+    samples: int
+    measured: Array
+    q0: Array
+    v0: Array
+    a0: Array
+
+
+class Replayer:
+    """Simulates changed models over all windows at once.
+
+    Args:
+        plant: The nominal scene.
+        episodes: What was measured, all with the same time step.
+        window: Length of a window [s].
+        signals: Names of the compared signals; `qpos/…` and `qvel/…` of joints, `force/…` of actuators.
+    """
+
+    def __init__(self, plant: Plant, episodes: Sequence[Episode], window: float, signals: Sequence[str]):
+        self.plant, self.episodes, self.signals = plant, list(episodes), list(signals)
+        self.dt = episodes[0].dt
+        self.h = float(plant.model.opt.timestep)
+        leap = [int(getattr(mujoco.mjtIntegrator, f"mjINT_{k}")) for k in ("EULER", "IMPLICIT", "IMPLICITFAST")]
+        self.half = self.h / 2 if plant.model.opt.integrator in leap else 0.0
+        self.smooth = [smooth(e, plant.joints) for e in self.episodes]
+        self.windows = self._cut(max(2, round(window / self.dt)))
+        self._nominal_ctrl: Array | None = None
+        self._along: tuple[Array, Array] | None = None
+        self.simulations = 0
+
+    def simulate(
+        self,
+        changes: Sequence[Change],
+        pick: Index | None = None,
+        shift: Array | None = None,
+        force: Array | None = None,
+    ) -> Array:
+        """Predictions of K changed models, [K, W, n, S].
+
+        Args:
+            changes: One each model.
+            pick: Windows to simulate; all if None.
+            shift: Added to the start, [K, 2 nj] (positions, then velocities); 0 if None.
+            force: Generalised force on the joints at every physics step, [K, W, N, nj]; 0 if None.
+        """
+        w = self.windows
+        pick = np.arange(len(w.start), dtype=np.int_) if pick is None else pick
+        models = [self.plant.compile(c) for c in changes]
+        out = np.empty((len(changes), len(pick), w.samples, len(self.signals)))
+        if any(c.frictions for c in changes):
+            dry = self._dry_friction(changes, pick)
+            force = dry if force is None else force + dry
+        for group in _alike(models):
+            out[group] = self._roll(
+                [models[k] for k in group],
+                [changes[k] for k in group],
+                pick,
+                None if shift is None else shift[group],
+                None if force is None else force[group],
+            )
+        self.simulations += len(changes) * len(pick)
+        return np.clip(np.nan_to_num(out, nan=EXPLODED), -EXPLODED, EXPLODED)
+
+    def with_commands(self, change: Callable[[Array], Array]) -> Replayer:
+        """The same starts under other commands: f(ctrl [T, nu]) -> [T, nu] of every episode."""
+        other = copy.copy(self)
+        other.episodes = [replace(e, ctrl=change(e.ctrl)) for e in self.episodes]
+        other._nominal_ctrl = other._along = None
+        return other
+
+    @property
+    def steps(self) -> int:
+        """Physics steps in a window."""
+        return int(np.ceil(self.windows.samples * self.dt / self.h - 1e-6)) + 1
+
+    def step_times(self) -> Array:
+        """Time of each physics step of each window since its episode's start [s], [W, N]."""
+        return self.windows.start[:, None] * self.dt + self.h * np.arange(self.steps)
+
+    def _roll(
+        self, models: list[mujoco.MjModel], changes: list[Change], pick: Index, shift: Array | None, force: Array | None
+    ) -> Array:
+        m, w, nj, count = models[0], self.windows, len(self.plant.joints), len(pick)
+        qadr, vadr = self.plant.addresses(m)
+        data = mujoco.MjData(m)
+        initial = np.zeros(mujoco.mj_stateSize(m, FULL))
+        mujoco.mj_getState(m, data, initial, FULL)
+        state = np.tile(initial, (len(models), count, 1))
+        q = np.tile(w.q0[pick], (len(models), 1, 1))
+        v = np.tile(w.v0[pick] - self.half * w.a0[pick], (len(models), 1, 1))
+        for k, change in enumerate(changes if any(c.reads for c in changes) else []):
+            for i, joint in enumerate(self.plant.joints):
+                q[k, :, i] = change.unread(q[k, :, i], f"qpos/{joint}")
+                v[k, :, i] *= np.diff(change.unread(np.array([0.0, 1.0]), f"qpos/{joint}"))
+        if shift is not None:
+            q, v = q + shift[:, None, :nj], v + shift[:, None, nj:]
+        state[:, :, 1 + qadr], state[:, :, 1 + m.nq + vadr] = q, v
+        place_rotors(m, state[:, :, 1 : 1 + m.nq], state[:, :, 1 + m.nq : 1 + m.nq + m.nv])
+        nu, extra = len(self.plant.actuators), m.nu - len(self.plant.actuators)
+        inputs = np.zeros((len(models), count, self.steps, m.nu + (m.nv if force is not None else 0)))
+        order = [m.actuator(a).id for a in self.plant.actuators] if extra else list(range(nu))
+        for k, change in enumerate(changes):
+            inputs[k, :, :, order] = np.moveaxis(self._ctrl(change)[pick], -1, 0)
+        if force is not None:
+            inputs[..., m.nu + vadr] = force
+        if m.na:
+            first = [a for a in range(m.na) if a < nu]
+            state[:, :, 1 + m.nq + m.nv + np.array(first)] = inputs[:, :, 0, first]
+        rows = len(models) * count
+        states, sensed = mujoco.rollout.rollout(
+            [x for x in models for _ in range(count)],
+            data,
+            state.reshape(rows, -1),
+            inputs.reshape(rows, self.steps, -1),
+            control_spec=CTRL if force is None else FORCED,
+            skip_checks=False,
+        )
+        states, sensed = np.asarray(states, float), np.asarray(sensed, float)
+        shape = (len(models), count, self.steps)
+        qpos = np.concatenate([state[:, :, None, 1 + qadr], states[..., 1 + qadr].reshape(*shape, nj)], 2)
+        qvel = np.concatenate([state[:, :, None, 1 + m.nq + vadr], states[..., 1 + m.nq + vadr].reshape(*shape, nj)], 2)
+        out = self._read(qpos, qvel, sensed.reshape(*shape, -1), m)
+        for k, change in enumerate(changes if any(c.reads for c in changes) else []):
+            for i, name in enumerate(self.signals):
+                out[k, ..., i] = change.read(out[k, ..., i], name)
+        return out
+
+    def _read(self, qpos: Array, qvel: Array, sensed: Array, m: mujoco.MjModel) -> Array:
+        """Signals at the samples' times from states at the steps' times, [K, W, n, S]."""
+        times = self.dt * np.arange(1, self.windows.samples + 1)
+        columns = []
+        for name in self.signals:
+            kind, part = name.split("/", 1)
+            if kind == "qpos":
+                columns.append(_at(qpos[..., self.plant.joints.index(part)], times / self.h))
+            elif kind == "qvel":
+                columns.append(_at(qvel[..., self.plant.joints.index(part)], (times + self.half) / self.h))
+            else:
+                sensor = m.sensor(f"{FORCE}{part}" if kind == "force" else part)
+                columns.append(_at(sensed[..., int(sensor.adr[0])], times / self.h))
+        return np.stack(columns, -1)
+
+    def _ctrl(self, change: Change) -> Array:
+        """Mean command of each physics step of each window, [W, N, nu]."""
+        late = np.broadcast_to(np.asarray(change.delay, float), (len(self.plant.actuators),))
+        plain = not change.commands and not late.any()
+        if plain and self._nominal_ctrl is not None:
+            return self._nominal_ctrl
+        out = np.empty((len(self.windows.start), self.steps, len(late)))
+        edges = self.step_times()[:, :, None] + np.array([-self.half, self.h - self.half])
+        for i, episode in enumerate(self.episodes):
+            ctrl = episode.ctrl
+            for command in change.commands:
+                ctrl = command(ctrl, episode.dt)
+            mine = np.flatnonzero(self.windows.episode == i)
+            for a in range(len(late)):
+                out[mine, :, a] = _held_mean(ctrl[:, a], episode.dt, edges[mine] - late[a])
+        if plain:
+            self._nominal_ctrl = out
+        return out
+
+    def _dry_friction(self, changes: Sequence[Change], pick: Index) -> Array:
+        """Friction that depends on the actuators' load, along the recorded motion, [K, W, N, nj]."""
+        load, direction = self._along or self._load_and_direction()
+        self._along = (load, direction)
+        flat = load[pick].reshape(-1, load.shape[-1])
+        levels = [sum((f(flat) for f in c.frictions), np.zeros_like(flat)) for c in changes]
+        return -np.reshape(levels, (len(changes), *load[pick].shape)) * direction[pick]
+
+    def _load_and_direction(self) -> tuple[Array, Array]:
+        """Generalised force of the actuators, and the direction of motion (-1 to 1), at each step, [W, N, nj]."""
+        m, w = self.plant.model, self.windows
+        data = mujoco.MjData(m)
+        load = np.empty((len(w.start), self.steps, m.nv))
+        direction = np.empty_like(load)
+        times = self.step_times()
+        for i, s in enumerate(self.smooth):
+            mine = np.flatnonzero(w.episode == i)
+            rows = np.clip(np.round(times[mine] / self.dt).astype(int), 0, len(s.q) - 1)
+            forces = np.empty_like(s.q)
+            for k in range(len(s.q)):
+                data.qpos[:], data.qvel[:], data.ctrl[:] = s.q[k], s.v[k], self.episodes[i].ctrl[k]
+                mujoco.mj_fwdPosition(m, data)
+                mujoco.mj_fwdVelocity(m, data)
+                mujoco.mj_fwdActuation(m, data)
+                forces[k] = data.qfrc_actuator
+            load[mine] = forces[rows]
+            creep = np.maximum(3 * s.v_sd, 1e-3 * np.abs(s.v).max(0))
+            direction[mine] = np.tanh(s.v / creep)[rows]
+        return load, direction
+
+    def _cut(self, n: int) -> Windows:
+        episode, start = [], []
+        for i, e in enumerate(self.episodes):
+            first = np.arange(0, len(e.ctrl) - n, n)
+            episode += [i] * len(first)
+            start += list(first)
+        rows = [(i, np.arange(s + 1, s + n + 1)) for i, s in zip(episode, start, strict=True)]
+        measured = np.array([[self.episodes[i].signals[name][r] for name in self.signals] for i, r in rows])
+
+        def at_start(what: str) -> Array:
+            return np.array([getattr(self.smooth[i], what)[s] for i, s in zip(episode, start, strict=True)])
+
+        return Windows(
+            np.array(episode),
+            np.array(start),
+            n,
+            np.moveaxis(measured, 1, 2),
+            at_start("q"),
+            at_start("v"),
+            at_start("a"),
+        )
+
+
+def _alike(models: Sequence[mujoco.MjModel]) -> list[list[int]]:
+    """Indices of models of the same layout: only these can be rolled out in one call."""
+    groups: dict[tuple[int, ...], list[int]] = {}
+    for k, m in enumerate(models):
+        groups.setdefault((m.nq, m.nv, m.nu, m.na, m.nbody, m.ntendon, m.neq, m.nM, m.npair), []).append(k)
+    return list(groups.values())
+
+
+def _at(values: Array, position: NDArray[Any]) -> Array:
+    """Linear interpolation of [K, W, N] at fractional indices [n]."""
+    position = np.clip(position, 0, values.shape[2] - 1)
+    low = np.minimum(position.astype(int), values.shape[2] - 2)
+    part = position - low
+    if np.abs(part).max() < 1e-9:
+        return values[:, :, low]
+    return values[:, :, low] * (1 - part) + values[:, :, low + 1] * part
+
+
+def _held_mean(u: Array, dt: float, edges: Array) -> Array:
+    """Mean of a held command [T] over intervals [..., 2] of time since the first sample; constant beyond the ends."""
+    total = np.concatenate([[0.0], np.cumsum(u)]) * dt
+    x = edges / dt
+    inside = np.interp(x, np.arange(len(total)), total)
+    inside = inside + np.minimum(x, 0) * u[0] * dt + np.maximum(x - len(u), 0) * u[-1] * dt
+    return (inside[..., 1] - inside[..., 0]) / (edges[..., 1] - edges[..., 0])

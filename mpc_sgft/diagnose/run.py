@@ -1,0 +1,238 @@
+"""The whole way from files to a report."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+from tqdm import tqdm
+
+from mpc_sgft.diagnose import judge, repair
+from mpc_sgft.diagnose.check import episodes
+from mpc_sgft.diagnose.experiment import next_experiment
+from mpc_sgft.diagnose.fit import change_of
+from mpc_sgft.diagnose.flexible import flexible_fit
+from mpc_sgft.diagnose.library import candidates, numbers
+from mpc_sgft.diagnose.locate import locate
+from mpc_sgft.diagnose.name import Verdict, effect_probability, intervals, judge_entries
+from mpc_sgft.diagnose.name import choose as choose_set
+from mpc_sgft.diagnose.nominal import nominal_terms, refit_table
+from mpc_sgft.diagnose.plant import Change, Plant, load_plant
+from mpc_sgft.diagnose.prepare import Setup, prepare, scales
+from mpc_sgft.diagnose.record import Array, Episode, files, read_table
+from mpc_sgft.diagnose.report import MAX_CANDIDATES, Report
+from mpc_sgft.diagnose.search import Entry, search
+from mpc_sgft.diagnose.table import TABLE
+from mpc_sgft.errors import UserError
+
+
+def read(plant: Plant, data: Sequence[str | Path]) -> list[Episode]:
+    """All episodes of the files, on one clock.
+
+    Raises:
+        UserError: If they are not usable or do not share a sample time.
+    """
+    found = [e for path in files(data) for e in episodes(read_table(path), plant.actuators, plant.ranges())]
+    steps = [e.dt for e in found]
+    if max(steps) > 1.05 * min(steps):
+        raise UserError(
+            f"episodes have different sample times ({min(steps):g} to {max(steps):g} s); diagnose them apart."
+        )
+    return found
+
+
+def run(
+    model: str | Path | mujoco.MjModel | mujoco.MjSpec,
+    data: Sequence[str | Path],
+    *,
+    out: Path | None,
+    effects: Sequence[str] | None,
+    signals: Sequence[str] | None,
+    window: float | None,
+    held_out: float | Sequence[str] | None,
+    uncertain: Mapping[str, float],
+    seed: int,
+    max_effects: int,
+    progress: bool,
+) -> Report:
+    """As `mpc_sgft.diagnose.diagnose`."""
+    plant = load_plant(model)
+    return run_on(
+        plant,
+        read(plant, data),
+        out=out,
+        effects=effects,
+        signals=signals,
+        window=window,
+        held_out=held_out,
+        uncertain=uncertain,
+        seed=seed,
+        max_effects=max_effects,
+        progress=progress,
+    )
+
+
+def run_on(
+    plant: Plant,
+    recorded: Sequence[Episode],
+    *,
+    out: Path | None,
+    effects: Sequence[str] | None,
+    signals: Sequence[str] | None,
+    window: float | None,
+    held_out: float | Sequence[str] | None,
+    uncertain: Mapping[str, float],
+    seed: int,
+    max_effects: int,
+    progress: bool,
+) -> Report:
+    """As `run`, on episodes in memory."""
+    if max_effects < 1:
+        raise UserError(f"max_effects={max_effects}: at least one effect must be allowed.")
+    began, rng = time.perf_counter(), np.random.default_rng(seed)
+    setup = prepare(plant, recorded, nominal_terms(plant, uncertain), window=window, signals=signals, held_out=held_out)
+    sizes = scales(plant, setup.problem.replayer)
+    with tqdm(total=100, desc="diagnose", disable=not progress, bar_format="{desc} {bar} {n:.0f}% {postfix}") as bar:
+
+        def show(what: str, share: float) -> None:
+            bar.set_postfix_str(what)
+            bar.update(90 * share - bar.n)
+
+        entries = search(setup, candidates(plant, sizes, effects), max_effects, rng, show)
+        best = choose_set(setup, entries, rng)
+        flexible = flexible_fit(setup, best, sizes, rng)
+        verdict = judge_entries(setup, entries, flexible, rng)
+        bar.update(100 - bar.n)
+    notes = [n for e in recorded for n in e.notes]
+    if len(recorded) == 1:
+        notes.append("one episode only: its end is held out, so that both sides come from the same run")
+    if out is not None:
+        out.mkdir(parents=True, exist_ok=True)
+        notes += repair.write(plant, verdict.best, out)
+    report = assemble(setup, entries, verdict, notes, rng, flexible.error)
+    report.data["seconds"] = round(time.perf_counter() - began, 2)
+    if out is not None:
+        report.write(out)
+    return report
+
+
+def assemble(
+    setup: Setup, entries: list[Entry], verdict: Verdict, notes: list[str], rng: np.random.Generator, flexible: float
+) -> Report:
+    """Everything that the report says."""
+    best, replayer, base = verdict.best, setup.problem.replayer, setup.baseline
+    nominal, repaired = replayer.simulate([Change(), change_of(best.fit.terms, best.fit.values)])
+    measured = replayer.windows.measured
+    shown = verdict.kind in ("effect", "not_identifiable")
+    ties = [
+        {"effects": e.names, "probability": verdict.probability[e.key], "held_out_error": e.error, "reason": reason}
+        for e, reason in verdict.ties
+    ]
+    tied = [best, *(e for e, _ in verdict.ties)]
+    data: dict[str, Any] = {
+        "verdict": verdict.kind,
+        "reason": verdict.reason,
+        "effects": _effects(best, entries, verdict) if shown else [],
+        "candidates": _candidates(entries, best, verdict, rng),
+        "ties": ties,
+        "next_experiment": next_experiment(setup, tied) if len(tied) > 1 else "",
+        "nominal_refit": refit_table(list(base.terms), list(best.fit.values[: len(base.terms)])),
+        "where": locate(setup),
+        "held_out": _held_out(setup, nominal, repaired, measured, rng),
+        "noise_floor": {
+            name: {"noise": float(setup.noise[i]), "simulator": float(setup.floor[i])}
+            for i, name in enumerate(replayer.signals)
+        },
+        "residual_model_error": flexible,
+        "seconds": 0.0,
+        "repaired_model": "repaired.xml",
+        "effects_file": "effects.yaml",
+        "notes": notes,
+    }
+    return Report(data, measured, nominal, repaired, replayer)
+
+
+def _effects(best: Entry, entries: list[Entry], verdict: Verdict) -> list[dict[str, Any]]:
+    out = []
+    bounds = intervals(best)
+    shares = effect_probability(best, entries, verdict.probability)
+    for term, value, (low, high), share in zip(best.terms, best.values, bounds, shares, strict=True):
+        columns = [numbers(term.effect, term.names, x) for x in (value, low, high)]
+        units = dict(zip(term.names, term.units, strict=True))
+        sums = TABLE[term.effect].sums
+        out.append(
+            {
+                "name": term.effect,
+                "at": list(term.at),
+                "parameters": {
+                    name: {
+                        "value": columns[0][name],
+                        "unit": units.get(name) or units[sums[name][0]],
+                        "low": columns[1][name],
+                        "high": columns[2][name],
+                    }
+                    for name in columns[0]
+                },
+                "probability": share,
+            }
+        )
+    return out
+
+
+def _candidates(entries: list[Entry], best: Entry, verdict: Verdict, rng: np.random.Generator) -> list[dict[str, Any]]:
+    """Ranked: what is named, what ties, then the rest by error and size."""
+    front = [best.key, *(e.key for e, _ in verdict.ties)]
+    size = len(best.errors)
+
+    def order(e: Entry) -> tuple[int, float]:
+        place = front.index(e.key) if e.key in front else len(front)
+        return place, e.error * (1 + e.complexity / size)
+
+    out = []
+    for e in sorted(entries, key=order)[:MAX_CANDIDATES]:
+        interval = judge.gain(e.errors, np.zeros(size), 0.90, rng)
+        out.append(
+            {
+                "effects": e.names,
+                "held_out_error": e.error,
+                "low": interval.low,
+                "high": interval.high,
+                "probability": verdict.probability[e.key],
+            }
+        )
+    return out
+
+
+def _held_out(
+    setup: Setup, nominal: Array, repaired: Array, measured: Array, rng: np.random.Generator
+) -> dict[str, Any]:
+    """Root mean square error of the signal that is worst in units of its noise, on windows that were never fitted."""
+    held, problem = setup.held, setup.problem
+    before, after = (((p - measured)[held] ** 2).mean(1) for p in (nominal, repaired))  # [W, S]
+    i = int(np.argmax(before.mean(0) / problem.scale**2))
+    name = problem.replayer.signals[i]
+    picks = rng.integers(0, len(held), (judge.RESAMPLES, len(held)))
+    drops = 1 - np.sqrt(after[picks, i].mean(1) / np.maximum(before[picks, i].mean(1), 1e-300))
+    low, high = np.quantile(drops, [0.05, 0.95])
+    rms = [float(np.sqrt(x[:, i].mean())) for x in (before, after)]
+    plant = problem.replayer.plant
+    kind, part = name.split("/", 1)
+    unit = "1"
+    if kind in ("qpos", "qvel"):
+        slide = plant.model.joint(part).type[0] == int(mujoco.mjtJoint.mjJNT_SLIDE)
+        unit = ("m" if slide else "rad") + ("/s" if kind == "qvel" else "")
+    elif kind == "force":
+        unit = "N or N m"
+    return {
+        "signal": name,
+        "unit": unit,
+        "nominal": rms[0],
+        "repaired": rms[1],
+        "reduction": 1 - rms[1] / max(rms[0], 1e-300),
+        "low": float(low),
+        "high": float(high),
+    }

@@ -1,0 +1,180 @@
+"""Which sets of effects are worth judging: a beam search in which supersets start at their subsets' optimum."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from mpc_sgft.diagnose import judge
+from mpc_sgft.diagnose.fit import STEP, Fit, fit, left_out_errors, window_errors
+from mpc_sgft.diagnose.library import Term, enrich, includes
+from mpc_sgft.diagnose.prepare import Setup
+from mpc_sgft.diagnose.record import Array, Index
+
+BEAM = 3  # sets that are extended
+FULL = (8, 5, 4)  # candidates that get a full fit: alone, as a second effect, as a third
+SCREEN = 24  # windows to screen on
+INVISIBLE = 1e-4  # times the noise: an effect of typical size that changes less is no candidate
+SEEN = 1e-3  # a parameter whose derivative is smaller than this share of the largest changes nothing
+
+
+class Entry(NamedTuple):
+    """A set of effects, fitted and judged.
+
+    Attributes:
+        fit: Nominal terms and effects.
+        effects: Number of effects; they are the last terms.
+        errors: Error of every window when it is not fitted, [W fitted + W held].
+        complexity: Parameters of the effects that change anything.
+    """
+
+    fit: Fit
+    effects: int
+    errors: Array
+    complexity: int
+
+    @property
+    def terms(self) -> tuple[Term, ...]:
+        return self.fit.terms[len(self.fit.terms) - self.effects :]
+
+    @property
+    def values(self) -> tuple[Array, ...]:
+        return self.fit.values[len(self.fit.terms) - self.effects :]
+
+    @property
+    def names(self) -> list[str]:
+        return [t.label for t in self.terms]
+
+    @property
+    def key(self) -> frozenset[str]:
+        return frozenset(t.label + str(t.fixed) for t in self.terms)
+
+    @property
+    def error(self) -> float:
+        return float(self.errors.mean())
+
+
+class Proposal(NamedTuple):
+    terms: tuple[Term, ...]
+    start: tuple[Array, ...]
+    cost: float
+
+
+def entry(setup: Setup, f: Fit) -> Entry:
+    """Judge a fit on all windows: fitted ones by leaving out their block, the others as they are."""
+    nominal = len(setup.baseline.terms)
+    errors = np.concatenate([left_out_errors(f, setup.blocks), window_errors(setup.problem, f, setup.held)])
+    norms = np.sqrt((f.J**2).sum((0, 1)))
+    own = norms[sum(len(t.size) for t in f.terms[:nominal]) :]
+    seen = int((own > SEEN * max(float(own.max()), 1e-12)).sum()) if len(own) else 0
+    return Entry(f, len(f.terms) - nominal, errors, seen)
+
+
+def search(
+    setup: Setup,
+    terms: Sequence[Term],
+    max_effects: int,
+    rng: np.random.Generator,
+    report: Callable[[str, float], None] = lambda what, done: None,
+) -> list[Entry]:
+    """All sets that were fitted, baseline first.
+
+    Args:
+        setup: Problem and baseline.
+        terms: Candidates.
+        max_effects: Largest set.
+        rng: For the bootstrap that decides whether to go on.
+        report: Told what is being done, and the share that is done.
+    """
+    found = {frozenset(): entry(setup, setup.baseline)}
+    beam, best = list(found.values()), found[frozenset()]
+    for level in range(max_effects + 1):  # one more, in which simple effects may still be replaced by richer ones
+        new: dict[frozenset[str], Entry] = {}
+        for b, parent in enumerate(beam):
+            report(f"{' + '.join(parent.names) or 'nominal'}", (level + b / len(beam)) / (max_effects + 1))
+            ranked = screen(setup, parent, proposals(parent, terms, max_effects))
+            for proposal in ranked[: FULL[min(level, len(FULL) - 1)]]:
+                key = frozenset(t.label + str(t.fixed) for t in proposal.terms[len(setup.baseline.terms) :])
+                if key in found or key in new:
+                    continue
+                f = fit(setup.problem, proposal.terms, proposal.start, setup.fitted)
+                new[key] = entry(setup, f)
+        found |= new
+        if not new:
+            break
+        beam = sorted(new.values(), key=lambda e: e.error)[:BEAM]
+        if not judge.credible(best.errors, beam[0].errors, rng):
+            break
+        best = beam[0]
+    return list(found.values())
+
+
+def proposals(
+    parent: Entry, terms: Sequence[Term], max_effects: int
+) -> list[tuple[tuple[Term, ...], list[Array], int]]:
+    """Sets one step larger: (terms, start, index of the term that is new), one for each start of the new term."""
+    out = []
+    base, values = parent.fit.terms, parent.fit.values
+    mine = {t.label for t in parent.terms}
+    for term in terms:
+        if term.label in mine or any(includes(old, term) for old in parent.terms):
+            continue
+        simpler = [i for i, old in enumerate(base) if includes(term, old)]
+        if simpler:
+            i = simpler[0]
+            swapped = list(values)
+            swapped[i] = enrich(term, base[i], values[i])
+            out.append(((*base[:i], term, *base[i + 1 :]), swapped, i))
+        elif parent.effects < max_effects:
+            out += [((*base, term), [*values, start], len(base)) for start in term.starts]
+    return out
+
+
+def screen(setup: Setup, parent: Entry, options: list[tuple[tuple[Term, ...], list[Array], int]]) -> list[Proposal]:
+    """Order proposals by their error after one Gauss-Newton step, the best start of each set only."""
+    problem, pick = setup.problem, _spread(setup.fitted, SCREEN)
+    rows = np.searchsorted(setup.fitted, pick)
+    best: dict[frozenset[str], Proposal] = {}
+    for terms, start, new in options:
+        term = terms[new]
+        steps = [(-STEP if start[new][i] + STEP * s > term.high[i] else STEP) * s for i, s in enumerate(term.size)]
+        points = [start]
+        for i, step in enumerate(steps):
+            moved = list(start)
+            moved[new] = start[new] + step * np.eye(len(steps))[i]
+            points.append(moved)
+        r = problem.residuals(terms, points, pick)
+        J_new = np.moveaxis((r[1:] - r[0]) * (term.size / np.array(steps))[:, None, None], 0, -1)
+        if np.sqrt(np.mean(J_new**2)) < INVISIBLE:
+            continue
+        J_old = parent.fit.J[rows] if new == len(parent.fit.terms) else np.zeros((*r.shape[1:], 0))
+        J = np.concatenate([J_old, J_new], -1)
+        A, g = np.einsum("wmp,wmq->pq", J, J), np.einsum("wmp,wm->p", J, r[0])
+        A = A + np.diag(1e-3 * np.diag(A) + 1e-9 * max(float(np.diag(A).max()), 1e-30))
+        step = -np.linalg.solve(A, g)
+        tries = [_moved(terms, start, new, step * share, J_old.shape[-1]) for share in (1.0, 0.3)]
+        costs = [float(np.mean(r[0] ** 2)), *(problem.residuals(terms, tries, pick) ** 2).mean((1, 2))]
+        i = int(np.argmin(costs))
+        key = frozenset(t.label + str(t.fixed) for t in terms)
+        if key not in best or costs[i] < best[key].cost:
+            best[key] = Proposal(terms, tuple([start, *tries][i]), float(costs[i]))
+    return sorted(best.values(), key=lambda p: p.cost)
+
+
+def _moved(terms: Sequence[Term], start: Sequence[Array], new: int, step: Array, old: int) -> list[Array]:
+    """A point after a step in typical sizes: over all old terms and the new one, or over the new one alone."""
+    out, at = list(start), 0
+    for i in range(len(terms)) if old else [new]:
+        if i == new and old:
+            delta = step[old:]
+        else:
+            delta = step[at : at + len(terms[i].size)]
+            at += len(terms[i].size)
+        out[i] = np.clip(start[i] + delta * terms[i].size, terms[i].low, terms[i].high)
+    return out
+
+
+def _spread(windows: Index, count: int) -> Index:
+    return windows[np.unique(np.linspace(0, len(windows) - 1, min(count, len(windows))).astype(int))]

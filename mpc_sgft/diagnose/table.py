@@ -1,0 +1,119 @@
+"""Effects that diagnose looks for: sizes, starts, and which of them contain or imitate one another."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
+
+
+class Scales(NamedTuple):
+    """Typical sizes at one place: what "large" means there."""
+
+    force: float = 1.0  # N or N m, of the joint's generalised force
+    speed: float = 1.0  # m/s or rad/s
+    travel: float = 1.0  # m or rad, spread of the position
+    centre: float = 0.0  # m or rad, middle of the motion
+    inertia: float = 1.0  # kg or kg m^2 at the joint
+    command: float = 1.0  # of the actuator
+    peak: float = 1.0  # largest force of the actuator, N or N m
+    mass: float = 1.0  # kg of the body
+    dt: float = 0.001  # s between samples
+
+
+class Par(NamedTuple):
+    """One parameter. Starts and bounds are counted from the neutral value in the typical size."""
+
+    neutral: float | Callable[[Scales], float]
+    size: Callable[[Scales], float]
+    starts: tuple[float, ...] = (0.1,)
+    low: float = -100.0
+    high: float = 100.0
+
+
+class Row(NamedTuple):
+    parameters: Mapping[str, Par]
+    driven: bool = False  # only where a motor sits
+    sums: Mapping[str, tuple[str, str]] = {}  # the effect's parameter -> fitted ones that it is the sum of
+
+
+_force, _viscous = (lambda s: s.force), (lambda s: s.force / s.speed)
+_tilt = Par(0.0, lambda s: 0.1, (0.2,), -5.0, 5.0)
+
+TABLE: dict[str, Row] = {
+    "viscous_friction": Row({"coefficient": Par(0.0, _viscous)}),
+    "coulomb_friction": Row({"torque": Par(0.0, _force)}),
+    "asymmetric_friction": Row({"forward": Par(0.0, _viscous), "backward": Par(0.0, _viscous)}),
+    "stribeck_friction": Row(
+        {
+            "coulomb": Par(0.0, _force, (0.1, 0.1)),
+            "excess": Par(0.0, _force, (0.1, 0.1), 0.0),
+            "velocity": Par(0.0, lambda s: s.speed, (0.1, 0.5), 0.01, 3.0),
+        },
+        sums={"static": ("coulomb", "excess")},
+    ),
+    "load_dependent_friction": Row({"coefficient": Par(0.0, lambda s: 1.0, (0.05,))}, driven=True),
+    "quadratic_drag": Row({"coefficient": Par(0.0, lambda s: s.force / s.speed**2)}),
+    "joint_stiffness": Row(
+        {
+            "stiffness": Par(0.0, lambda s: s.force / s.travel),
+            "rest": Par(lambda s: s.centre, lambda s: s.travel, (0.0,), -5.0, 5.0),
+        }
+    ),
+    "armature": Row({"inertia": Par(0.0, lambda s: s.inertia)}),
+    "backlash": Row({"gap": Par(0.0, lambda s: 0.1 * s.travel, (0.03, 0.3), 0.0, 10.0)}, driven=True),
+    "gravity_tilt": Row({"angle": _tilt, "roll": _tilt}),
+    "payload": Row({"mass": Par(0.0, lambda s: s.mass, (0.2,))}),
+    "actuator_gain": Row({"gain": Par(1.0, lambda s: 1.0, (-0.1, 0.1), -0.95, 2.0)}),
+    "actuator_offset": Row({"offset": Par(0.0, lambda s: s.command, (0.05, -0.05))}),
+    "deadband": Row({"width": Par(0.0, lambda s: s.command, (0.05, 0.3), 0.0, 3.0)}),
+    "torque_saturation": Row({"limit": Par(lambda s: s.peak, lambda s: s.peak, (-0.15, -0.5), -0.97, 0.0)}),
+    "sensor_offset": Row({"offset": Par(0.0, lambda s: s.travel, (0.1, -0.1), -3.0, 3.0)}),
+    "sensor_gain": Row({"gain": Par(1.0, lambda s: 1.0, (-0.05, 0.05), -0.8, 2.0)}),
+    "actuator_delay": Row({"delay": Par(0.0, lambda s: 0.02, (0.25, 1.0), 0.0, 15.0)}),
+    "actuator_lag": Row({"time_constant": Par(0.0, lambda s: 0.02, (0.25, 1.0), 0.0, 15.0)}),
+}
+
+# richer effect -> simpler one -> {parameter of the richer: parameter of the simpler that gives the same physics}
+INCLUDES: dict[str, dict[str, dict[str, str]]] = {
+    "asymmetric_friction": {"viscous_friction": {"forward": "coefficient", "backward": "coefficient"}},
+    "stribeck_friction": {"coulomb_friction": {"coulomb": "torque"}},
+}
+
+
+class Equivalence(NamedTuple):
+    """Effects that data of this kind cannot separate where `reason` applies.
+
+    Attributes:
+        effects: Their names.
+        reason: Why, and what would separate them.
+        canonical: The name that is reported if they tie, because all of them are one term of the equations; None if
+            the answer is then `not_identifiable`.
+    """
+
+    effects: frozenset[str]
+    reason: str
+    canonical: str | None = None
+
+
+EQUIVALENT = [
+    Equivalence(
+        frozenset({"actuator_offset", "gravity_tilt"}),
+        "a constant force along a slide: an offset of its drive and a tilt of its base are the same term of the "
+        "equations; a spirit level, or a second axis, tells them apart",
+        "actuator_offset",
+    ),
+    Equivalence(
+        frozenset({"payload", "armature"}),
+        "on a slide, or a hinge without gravity, a load and a rotor are the same inertia; weigh the load",
+    ),
+    Equivalence(
+        frozenset({"actuator_gain", "payload", "armature", "sensor_gain"}),
+        "where inertia is all that resists, force over inertia is all that shows; a measured force or a known load "
+        "separates them",
+    ),
+    Equivalence(
+        frozenset({"actuator_delay", "sensor_delay"}),
+        "a loop does not show which side is late; a measured force or current does",
+        "actuator_delay",
+    ),
+]

@@ -1,0 +1,158 @@
+"""What a user can get wrong, and what they are told."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mpc_sgft.diagnose.check import episodes
+from mpc_sgft.diagnose.plant import load_plant
+from mpc_sgft.diagnose.record import Table, files, read_table, write_csv
+from mpc_sgft.errors import UserError
+
+RANGES = {"x": (-2.0, 2.0)}
+
+
+def _table(**changed: np.ndarray) -> Table:
+    t = np.arange(200) * 0.01
+    columns = {"time": t, "ctrl/motor": np.sin(t), "qpos/x": 0.1 * np.cos(t)}
+    return Table("run1", {**columns, **{k.replace("__", "/"): v for k, v in changed.items()}})
+
+
+def test_a_good_table_becomes_one_episode() -> None:
+    (episode,) = episodes(_table(), ["motor"], RANGES)
+    assert episode.ctrl.shape == (200, 1) and episode.dt == pytest.approx(0.01) and set(episode.signals) == {"qpos/x"}
+
+
+def test_a_misnamed_column_is_told_with_the_nearest_name() -> None:
+    table = _table()
+    table.columns["qpos/slide_x"] = table.columns.pop("qpos/x")
+    with pytest.raises(UserError, match=r"qpos/x \(nearest: qpos/slide_x\).*The file has: time, ctrl/motor"):
+        episodes(table, ["motor"], RANGES)
+
+
+def test_an_actuator_that_the_model_lacks() -> None:
+    with pytest.raises(UserError, match="ctrl/arm: the model has no such actuator. It has: motor"):
+        episodes(_table(ctrl__arm=np.zeros(200)), ["motor"], RANGES)
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"time": np.r_[np.arange(100), np.arange(100)] * 0.01}, "time does not increase at row 100"),
+        ({"time": np.arange(200) * 10.0}, "is this milliseconds"),
+        ({"qpos__x": np.r_[np.ones(7), np.nan, np.ones(192)]}, "qpos/x is not a number in row 7"),
+        ({"qpos__x": 100 * np.cos(np.arange(200))}, "degrees"),
+        ({"qpos__x": 1000 * np.cos(np.arange(200))}, "millimetres"),
+        ({"qpos__x": np.zeros(200), "ctrl__motor": np.ones(200)}, "no joint moves, and the commands are constant"),
+    ],
+)
+def test_numbers_that_cannot_be(changed: dict[str, np.ndarray], message: str) -> None:
+    with pytest.raises(UserError, match=message):
+        episodes(_table(**changed), ["motor"], RANGES)
+
+
+def test_missing_time() -> None:
+    table = _table()
+    del table.columns["time"]
+    with pytest.raises(UserError, match="columns missing: time"):
+        episodes(table, ["motor"], RANGES)
+
+
+def test_a_pause_splits_the_recording() -> None:
+    time = np.r_[np.arange(100) * 0.01, 5 + np.arange(100) * 0.01]
+    first, second = episodes(_table(time=time), ["motor"], RANGES)
+    assert len(first.ctrl) == len(second.ctrl) == 100 and "1 pauses" in first.notes[0]
+
+
+def test_jitter_is_evened_out() -> None:
+    rng = np.random.default_rng(0)
+    time = np.arange(200) * 0.01 + rng.uniform(-0.002, 0.002, 200)
+    (episode,) = episodes(_table(time=time, qpos__x=np.sin(time)), ["motor"], RANGES)
+    even = time[0] + episode.dt * np.arange(len(episode.ctrl))
+    np.testing.assert_allclose(episode.signals["qpos/x"], np.sin(even), atol=1e-6)
+
+
+def test_files_and_folders(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="no episodes in this folder"):
+        files([tmp_path])
+    with pytest.raises(UserError, match="no such file"):
+        files([tmp_path / "absent.csv"])
+    (tmp_path / "notes.txt").write_text("x")
+    with pytest.raises(UserError, match="unknown ending '.txt'"):
+        files([tmp_path / "notes.txt"])
+
+
+def test_csv_and_parquet_hold_the_same(tmp_path: Path) -> None:
+    import pyarrow
+    import pyarrow.parquet
+
+    columns = _table().columns
+    write_csv(tmp_path / "a.csv", columns)
+    pyarrow.parquet.write_table(pyarrow.table(columns), tmp_path / "a.parquet")
+    for name in ("a.csv", "a.parquet"):
+        read = read_table(tmp_path / name).columns
+        assert list(read) == list(columns)
+        for key, values in columns.items():
+            np.testing.assert_allclose(read[key], values, atol=1e-9)
+
+
+@pytest.mark.parametrize("text", ["", "time,ctrl/m\n", "time,ctrl/m\n0,1\n0.1\n", "time\nzero\n"])
+def test_broken_csv(tmp_path: Path, text: str) -> None:
+    (tmp_path / "a.csv").write_text(text)
+    with pytest.raises(UserError, match=r"a\.csv"):
+        read_table(tmp_path / "a.csv")
+
+
+def test_broken_parquet_and_mcap(tmp_path: Path) -> None:
+    for name in ("a.parquet", "a.mcap"):
+        (tmp_path / name).write_bytes(b"nothing of the kind")
+        with pytest.raises(UserError, match=name):
+            read_table(tmp_path / name)
+
+
+def test_a_truncated_mcap_is_read_as_far_as_it_is_whole(tmp_path: Path) -> None:
+    from mpc_sgft.record import EpisodeWriter
+
+    path = tmp_path / "a.mcap"
+    with EpisodeWriter(path, {"joint_names": ["x"], "actuator_names": ["motor"]}) as writer:
+        for k in range(12):
+            t = 0.2 * k + 0.01 * np.arange(20)
+            row = {"step": k, "time": t[-1], "observation": [0.0], "action": [0.0], "action_sent": [0.0], "reward": 0.0}
+            row |= {"terminated": False, "truncated": False, "success": False}
+            joints = {"qpos": np.sin(t)[:, None], "qvel": np.cos(t)[:, None], "ctrl": np.cos(t)[:, None]}
+            writer.step(row, {"time": t, **joints})
+        writer.close({})
+    whole = path.read_bytes()
+    path.write_bytes(whole[: int(0.6 * len(whole))])
+    table = read_table(path)
+    assert 50 < len(table.columns["time"]) < 240 and "whole steps kept" in (table.lost or "")
+    (episode,) = episodes(table, ["motor"], RANGES)
+    assert "whole steps kept" in episode.notes[0]
+
+
+def test_models_that_do_not_load(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="no such model file"):
+        load_plant(tmp_path / "absent.xml")
+    (tmp_path / "broken.xml").write_text("<mujoco><worldbody>")
+    with pytest.raises(UserError, match="MuJoCo cannot load this scene"):
+        load_plant(tmp_path / "broken.xml")
+    (tmp_path / "still.xml").write_text("<mujoco><worldbody><geom size='1'/></worldbody></mujoco>")
+    with pytest.raises(UserError, match="no actuator or no joint"):
+        load_plant(tmp_path / "still.xml")
+
+
+def test_the_command_line_answers_and_refuses(command: Callable, slide: Path, tmp_path: Path) -> None:
+    answer = command("diagnose", "--help")
+    assert answer.returncode == 0 and "--held-out" in answer.stdout
+    for args, words in (
+        ((), "--model is missing"),
+        (("--model", str(slide), "--data", str(tmp_path / "absent")), "no such file or folder"),
+        (("--model", str(slide), "--data", str(tmp_path), "--uncertain", "mass"), "quantity=share"),
+    ):
+        answer = command("diagnose", *args)
+        assert answer.returncode == 2 and words in answer.stderr, answer.stderr
+        assert "Traceback" not in answer.stderr

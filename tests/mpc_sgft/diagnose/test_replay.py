@@ -1,0 +1,81 @@
+"""The simulator's side: held commands, its own error, and effects with a memory."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import pytest
+
+from mpc_sgft.diagnose.library import candidates, enrich, make_term
+from mpc_sgft.diagnose.plant import Change, Plant
+from mpc_sgft.diagnose.record import Episode
+from mpc_sgft.diagnose.replay import Replayer, _held_mean
+from mpc_sgft.diagnose.table import TABLE, Scales
+
+SLIDE = """<mujoco><option timestep="0.002"/><worldbody><body name="cart"><joint name="x" type="slide" axis="1 0 0"/>
+<geom size="0.1" mass="2"/></body></worldbody><actuator><motor name="motor" joint="x"/></actuator></mujoco>"""
+
+
+@pytest.fixture
+def plant() -> Plant:
+    return Plant(mujoco.MjSpec.from_string(SLIDE))
+
+
+def _sine() -> Episode:
+    """m q'' = u with u = 2 sin(3 t): q = -sin(3 t) / 9 + t / 3 from rest; u is held for 1 ms."""
+    t = np.arange(2000) * 0.001
+    held = 2 * np.sin(3 * (t + 0.0005))
+    return Episode("sine", 0.001, held[:, None], {"qpos/x": -np.sin(3 * t) / 9 + t / 3})
+
+
+def test_a_right_model_predicts_to_the_second_order(plant) -> None:
+    replayer = Replayer(plant, [_sine()], 0.5, ["qpos/x"])
+    error = replayer.simulate([Change()])[0] - replayer.windows.measured
+    assert np.abs(error).max() < 3e-6  # the first order alone would be h a t / 2 = 5e-4 m
+
+
+def test_held_mean_by_hand() -> None:
+    u = np.array([1.0, 3.0])  # held on [0, 1) and [1, 2)
+    edges = np.array([[0.0, 1.0], [0.5, 1.5], [1.5, 3.0], [-1.0, 0.5]])
+    np.testing.assert_allclose(_held_mean(u, 1.0, edges), [1.0, 2.0, 3.0, 1.0])
+
+
+def test_a_delay_reaches_back_before_the_window(plant) -> None:
+    episode = _sine()
+    replayer = Replayer(plant, [episode], 0.5, ["qpos/x"])
+    late = make_term(plant, "actuator_delay", "motor", Scales()).build(np.array([0.05]))
+    moved = np.vstack([np.repeat(episode.ctrl[:1], 50, 0), episode.ctrl[:-50]])
+    shifted = Replayer(plant, [Episode("late", 0.001, moved, episode.signals)], 0.5, ["qpos/x"])
+    np.testing.assert_allclose(replayer.simulate([late]), shifted.simulate([Change()]), atol=1e-12)
+
+
+def test_effects_in_one_batch_do_not_disturb_each_other(plant) -> None:
+    replayer = Replayer(plant, [_sine()], 0.5, ["qpos/x"])
+    terms = candidates(plant, {"x": Scales(), "motor": Scales(), "cart": Scales(), "qpos/x": Scales()}, None)
+    changes = [t.build(t.starts[0]) for t in terms]
+    together = replayer.simulate([*changes, Change()])
+    for change, values in zip(changes, together[:-1], strict=True):
+        np.testing.assert_array_equal(replayer.simulate([change])[0], values)
+
+
+def test_every_effect_of_the_table_is_known_and_neutral_at_its_neutral_value(plant) -> None:
+    replayer = Replayer(plant, [_sine()], 0.5, ["qpos/x"])
+    nominal = replayer.simulate([Change()])[0]
+    for name in TABLE:
+        place = {"joint": "x", "actuator": "motor", "body": "cart", "signal": "qpos/x"}.get(
+            __import__(f"envs.effects.{name}", fromlist=["EFFECT"]).EFFECT.place, ""
+        )
+        term = make_term(plant, name, place, Scales(peak=5.0))
+        same = replayer.simulate([term.build(np.clip(term.neutral, term.low, term.high))])[0]
+        np.testing.assert_allclose(same, nominal, atol=1e-6, err_msg=name)
+
+
+def test_a_richer_effect_starts_as_the_simpler_one(plant) -> None:
+    replayer = Replayer(plant, [_sine()], 0.5, ["qpos/x"])
+    for rich, simple, value in (
+        ("asymmetric_friction", "viscous_friction", 0.7),
+        ("stribeck_friction", "coulomb_friction", 0.3),
+    ):
+        old, new = (make_term(plant, n, "x", Scales()) for n in (simple, rich))
+        a, b = replayer.simulate([old.build(np.array([value])), new.build(enrich(new, old, np.array([value])))])
+        np.testing.assert_allclose(a, b, atol=1e-7)
