@@ -1,0 +1,59 @@
+"""The command generates, runs a solver and scores; a made-up solver stands in for diagnose."""
+
+import json
+import sys
+import types
+from pathlib import Path
+
+import pytest
+
+from tools import blind_benchmark
+from tools.blind import draw as drawing
+
+
+@pytest.fixture
+def solver(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
+    """A stand-in for mpc_sgft.diagnose that always answers `none`; the list of what it was asked."""
+    asked: list[Path] = []
+
+    class Report:
+        def as_dict(self) -> dict:
+            return {"verdict": "none", "effects": [], "candidates": [], "ties": []}
+
+    def diagnose(model: Path, data: list[Path], **options: object) -> Report:
+        assert set(options) >= {"out", "effects", "signals", "window", "held_out", "uncertain", "seed", "max_effects"}
+        asked.append(Path(model))
+        if len(asked) == 1:
+            raise RuntimeError("first one breaks")
+        return Report()
+
+    fake = types.ModuleType("mpc_sgft.diagnose")
+    fake.diagnose = diagnose  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "mpc_sgft.diagnose", fake)
+    return asked
+
+
+def test_generate_run_score_and_resume(
+    tmp_path: Path, solver: list[Path], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def few(seed: int, count: int, least_none: int = 0) -> list[drawing.Case]:
+        return [c for c in drawing.draw(seed, 300) if c.plant == "slide" and c.group == "none"][:count]
+
+    monkeypatch.setattr(blind_benchmark, "draw", few)
+    line = ["--seed", "4", "--cases", "2", "--out", str(tmp_path / "b"), "--jobs", "1", "--no-baselines"]
+    assert blind_benchmark.main(line) == 0
+    printed = capsys.readouterr().out
+    assert (tmp_path / "b/labels.sha256").read_text().strip() in printed
+    assert len(solver) == 2
+    said = [json.loads(p.read_text())["verdict"] for p in sorted((tmp_path / "b/reports").glob("*/blind.json"))]
+    assert said == ["error", "none"] and "no effect: false alarms" in printed
+    assert not list((tmp_path / "b").rglob("*.part"))
+    for name in ("scores.csv", "scores_cases.csv", "scores_confusion.png", "scores_power.png"):
+        assert (tmp_path / "b" / name).stat().st_size > 0
+    assert blind_benchmark.main(line) == 0
+    assert len(solver) == 2  # nothing is run twice
+
+
+def test_errors_are_one_line_and_exit_2(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert blind_benchmark.main(["--seed", "4", "--out", str(tmp_path), "--only", "score"]) == 2
+    assert "run with --only generate first" in capsys.readouterr().err

@@ -1,0 +1,19 @@
+"""The blind benchmark of `diagnose`: data from plants that share no dynamics code with the solver, and their scores.
+
+| file         | what it holds                                                                                 |
+|--------------|-----------------------------------------------------------------------------------------------|
+| plants.py    | four plants: equations of motion derived by hand, and their energy                            |
+| mjcf.py      | the nominal model of each, which is all that the solver gets to see                           |
+| truths.py    | what reality adds: friction, drives, transmissions, one table of neutral values               |
+| integrate.py | Runge-Kutta steps with stick and slip located as events, many rows at once                    |
+| excite.py    | reference motions                                                                             |
+| loop.py      | controller, drive, plant and encoder in closed loop, or the plant driven by recorded commands |
+| library.py   | every effect: where it can sit, how large it may be, what parameters the solver should report |
+| detect.py    | the size at which an effect becomes detectable                                                |
+| draw.py      | which cases there are, from a seed                                                            |
+| cases.py     | folders of cases, labels apart from them, the hash of the labels                              |
+| fr3.py       | the FR3 through MuJoCo, at another time step, with effects as Python callbacks                |
+| solve.py     | runs `diagnose` on the folders                                                                |
+| features.py, baselines.py | simpler ways to name an effect, for comparison                                   |
+| score.py, plots.py | scores with intervals, confusion matrix, power curves                                   |
+"""

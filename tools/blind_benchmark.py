@@ -1,0 +1,168 @@
+"""The blind benchmark of `diagnose`: make cases from a seed, hide the labels, run, score, draw.
+
+    python -m tools.blind_benchmark --seed 20261 --cases 300 --out runs/blind [--jobs 2] [--csv results/blind.csv]
+                                    [--only generate|run|score] [--least-none 100] [--no-oracle] [--no-baselines]
+
+The labels' SHA-256 is printed before the solver starts, and checked before scoring. A seed that was used to tune the
+solver must not be reported. Everything is resumable: what is on disk is not done again. The CSV has one row a score;
+beside it go <csv>_cases.csv with one row a case, <csv>_confusion.png and <csv>_power.png.
+"""
+
+import argparse
+import csv
+import json
+import os
+import platform
+import sys
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+from tools.blind import baselines, cases, score
+from tools.blind.draw import draw
+from tools.blind.make import make
+from tools.blind.plots import draw as draw_plots
+from tools.blind.solve import reports, solve_all
+
+STEPS = ("generate", "run", "score")
+
+
+def generate(out: Path, seed: int, count: int, least_none: int) -> str:
+    """Cases and labels on disk; the labels' hash. Nothing is made anew if they are there.
+
+    Raises:
+        ValueError: If the folder holds cases of another seed or another number of them.
+    """
+    drawn = draw(seed, count, least_none)
+    if (out / "labels.sha256").is_file():
+        there = cases.labels(out)
+        if cases.seed_of(out) != seed or len(there) != len(drawn):
+            raise ValueError(
+                f"{out} holds {len(there)} cases of seed {cases.seed_of(out)}, not {len(drawn)} of seed {seed}. "
+                "Give another --out, or delete that folder."
+            )
+        return (out / "labels.sha256").read_text().strip()
+    with tqdm(total=len(drawn), desc="generate", unit="case") as bar:
+        return cases.write(out, make(drawn, bar.update), seed)
+
+
+def run(out: Path, jobs: int) -> None:
+    """The solver on every case."""
+    folders = sorted((out / "cases").iterdir())
+    with tqdm(total=len(folders), desc="diagnose", unit="case") as bar:
+        solve_all([(f, out / "reports" / f.name, None) for f in folders], jobs, bar.update)
+
+
+def run_oracle(out: Path, jobs: int) -> None:
+    """The solver, told the true names, on single-effect cases; only after all blind runs are done.
+
+    Raises:
+        ValueError: If blind runs are missing.
+    """
+    hidden = cases.labels(out)
+    if missing := sorted(set(hidden) - set(reports(out))):
+        raise ValueError(
+            f"{len(missing)} cases have no report yet ({missing[0]} …): the oracle comes after the blind runs"
+        )
+    single = {n: [e["name"] for e in y["effects"]] for n, y in hidden.items() if y["group"] == "single"}
+    with tqdm(total=len(single), desc="oracle", unit="case") as bar:
+        solve_all([(out / "cases" / n, out / "oracle" / n, names) for n, names in single.items()], jobs, bar.update)
+
+
+def run_baselines(out: Path, jobs: int) -> dict[str, dict[str, dict[str, Any]]]:
+    """Reports by baseline and case; kept in baselines.json."""
+    path = out / "baselines.json"
+    if path.is_file():
+        return json.loads(path.read_text())
+    folders = sorted((out / "cases").iterdir())
+    with ProcessPoolExecutor(jobs) as pool:
+        every = list(tqdm(pool.map(baselines.run, folders), total=len(folders), desc="baselines", unit="case"))
+    found = {b: {f.name: r[b] for f, r in zip(folders, every, strict=True)} for b in baselines.NAMES}
+    path.write_text(json.dumps(found))
+    return found
+
+
+def write_scores(out: Path, target: Path, compared: dict[str, dict[str, dict[str, Any]]], seed: int) -> None:
+    """Score everything, print the table, and write CSV files and pictures."""
+    hidden, ours = cases.labels(out), reports(out)
+    oracles = reports(out, "oracle")
+    rows = []
+    for method, said in {"diagnose": ours, **compared}.items():
+        for s in score.table(said, hidden, oracles if method == "diagnose" else None):
+            if s.count:
+                rows.append({"method": method, "score": s.name, "value": round(s.value, 4), "low": round(s.low, 4)})
+                rows[-1] |= {"high": round(s.high, 4), "hits": round(s.hits, 2), "of": s.count, "goal": s.goal}
+    machine = {"seed": seed, "labels_sha256": (out / "labels.sha256").read_text().strip()[:16]}
+    machine |= {"cores": os.cpu_count(), "python": platform.python_version(), "system": platform.platform()}
+    _write(target, [row | machine for row in rows])
+    per_case = [_case_row(n, y, ours[n]) for n, y in hidden.items() if n in ours]
+    _write(target.with_name(target.stem + "_cases.csv"), per_case)
+    pictures = draw_plots(ours, hidden, target.parent, target.stem) if ours else []
+    for row in rows:
+        interval = f"[{row['low']:.3f}, {row['high']:.3f}]"
+        print(f"{row['method']:15s} {row['score']:45s} {row['value']:.3f} {interval} of {row['of']:3d}  {row['goal']}")
+    print("written:", target, *pictures)
+
+
+def _case_row(name: str, label: dict[str, Any], report: dict[str, Any]) -> dict[str, Any]:
+    keys = ("group", "kind", "plant", "seconds", "noise_level", "force_channel")
+    held = report.get("held_out", {})
+    return {
+        "case": name,
+        **{k: label[k] for k in keys},
+        "truth": " ".join(f"{e['name']}@{','.join(e['at'])}x{e['multiple']:.2f}" for e in label["effects"]),
+        "verdict": report["verdict"],
+        "said": " ".join(score.named(report)),
+        "right": score.top1(report, label) if label["group"] in ("single", "pair") else "",
+        "nominal": held.get("nominal", ""),
+        "repaired": held.get("repaired", ""),
+        "seconds_spent": round(report.get("wall_seconds", float("nan")), 2),
+    }
+
+
+def _write(path: Path, rows: list[dict[str, Any]]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, fieldnames=list(rows[0]) if rows else ["method"])
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def main(argv: list[str]) -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seed", type=int, required=True, help="of the cases; a fresh one for what is reported")
+    parser.add_argument("--cases", type=int, default=300, help="how many (default 300)")
+    parser.add_argument("--least-none", type=int, default=0, help="add cases without effect until there are so many")
+    parser.add_argument("--out", type=Path, required=True, help="folder for cases, labels and reports")
+    parser.add_argument("--jobs", type=int, default=2, help="processes (default 2)")
+    parser.add_argument("--only", choices=STEPS, help="one step (default: all)")
+    parser.add_argument("--csv", type=Path, help="scores (default OUT/scores.csv)")
+    parser.add_argument("--no-oracle", action="store_true", help="leave out the runs that know the true names")
+    parser.add_argument("--no-baselines", action="store_true", help="leave out the simpler ways to name")
+    args = parser.parse_args(argv)
+    os.environ.setdefault("OMP_NUM_THREADS", "1")  # for the processes that are started
+    steps = (args.only,) if args.only else STEPS
+    try:
+        if "generate" in steps:
+            generate(args.out, args.seed, args.cases, args.least_none)
+        cases.labels(args.out)
+        if cases.seed_of(args.out) != args.seed:
+            raise ValueError(f"{args.out} holds cases of seed {cases.seed_of(args.out)}, not of {args.seed}")
+        print("labels SHA-256", (args.out / "labels.sha256").read_text().strip(), flush=True)
+        if "run" in steps:
+            run(args.out, args.jobs)
+            if not args.no_oracle:
+                run_oracle(args.out, args.jobs)
+        if "score" in steps:
+            compared = {} if args.no_baselines else run_baselines(args.out, args.jobs)
+            write_scores(args.out, args.csv or args.out / "scores.csv", compared, args.seed)
+    except ValueError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
