@@ -12,6 +12,7 @@ import pytest
 import yaml
 from omegaconf import OmegaConf
 
+from envs.effects import available
 from mpc_sgft import choices, cli, compose, run_folder
 from mpc_sgft.errors import Stopped, UserError, from_config
 

@@ -1,4 +1,4 @@
-"""Learning curves of a study: median over seeds with a bootstrap interval, a panel for each gap.
+"""Learning curves of a study: mean over seeds with a bootstrap interval, a panel for each gap.
 
 python tools/plot_study.py results/transfer_sgft.csv results/transfer_tdmpc2.csv docs/transfer.png
 """
@@ -50,13 +50,14 @@ def main() -> None:
             mean = [np.mean(points[k]) for k in x]
             low, high = zip(*(interval(points[k]) for k in x), strict=True)
             colour = COLOURS.get(label)
-            (line,) = axis.plot(x, mean, marker="o", markersize=3, label=label, color=colour)
+            (line,) = axis.plot(
+                x, mean, marker="o", markersize=3, label=f"{label}, seeds: {len(points[x[0]])}", color=colour
+            )
             axis.fill_between(x, low, high, alpha=0.2, color=line.get_color())
         axis.set(title=f"gap: {gap}", xlabel="real rollouts", ylim=(-0.02, 1.02))
         axis.grid(alpha=0.3)
-    seeds = max(len(v) for methods in curves.values() for points in methods.values() for v in points.values())
-    axes[0][0].set_ylabel(f"success, mean of {seeds} seeds, 95 % bootstrap")
-    axes[0][0].legend(frameon=False)
+        axis.legend(frameon=False)
+    axes[0][0].set_ylabel("success, mean and 95 % bootstrap")
     figure.tight_layout()
     args.png.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(args.png, dpi=130)
