@@ -12,7 +12,6 @@
 | detect.py    | the size at which an effect becomes detectable                                                |
 | draw.py      | which cases there are, from a seed                                                            |
 | cases.py     | folders of cases, labels apart from them, the hash of the labels                              |
-| fr3.py       | the FR3 through MuJoCo, at another time step, with effects as Python callbacks                |
 | solve.py     | runs `diagnose` on the folders                                                                |
 | features.py, baselines.py | simpler ways to name an effect, for comparison                                   |
 | score.py, plots.py | scores with intervals, confusion matrix, power curves                                   |
