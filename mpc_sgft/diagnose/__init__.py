@@ -53,11 +53,13 @@ def diagnose(
     Raises:
         UserError: For data or a model that cannot be used; the message says what came and what to do.
     """
-    from mpc_sgft.diagnose.run import run
+    from mpc_sgft.diagnose.plant import load_plant
+    from mpc_sgft.diagnose.run import read, run
 
+    plant = load_plant(model)
     return run(
-        model,
-        data,
+        plant,
+        read(plant, data),
         out=out,
         effects=effects,
         signals=signals,

@@ -21,7 +21,7 @@ from mpc_sgft.diagnose.locate import locate
 from mpc_sgft.diagnose.name import Verdict, effect_probability, intervals, judge_entries
 from mpc_sgft.diagnose.name import choose as choose_set
 from mpc_sgft.diagnose.nominal import nominal_terms, refit_table
-from mpc_sgft.diagnose.plant import Change, Plant, load_plant
+from mpc_sgft.diagnose.plant import Change, Plant
 from mpc_sgft.diagnose.prepare import Setup, prepare, scales
 from mpc_sgft.diagnose.record import Array, Episode, files, read_table
 from mpc_sgft.diagnose.report import MAX_CANDIDATES, Report
@@ -46,37 +46,6 @@ def read(plant: Plant, data: Sequence[str | Path]) -> list[Episode]:
 
 
 def run(
-    model: str | Path | mujoco.MjModel | mujoco.MjSpec,
-    data: Sequence[str | Path],
-    *,
-    out: Path | None,
-    effects: Sequence[str] | None,
-    signals: Sequence[str] | None,
-    window: float | None,
-    held_out: float | Sequence[str] | None,
-    uncertain: Mapping[str, float],
-    seed: int,
-    max_effects: int,
-    progress: bool,
-) -> Report:
-    """As `mpc_sgft.diagnose.diagnose`."""
-    plant = load_plant(model)
-    return run_on(
-        plant,
-        read(plant, data),
-        out=out,
-        effects=effects,
-        signals=signals,
-        window=window,
-        held_out=held_out,
-        uncertain=uncertain,
-        seed=seed,
-        max_effects=max_effects,
-        progress=progress,
-    )
-
-
-def run_on(
     plant: Plant,
     recorded: Sequence[Episode],
     *,
@@ -90,7 +59,7 @@ def run_on(
     max_effects: int,
     progress: bool,
 ) -> Report:
-    """As `run`, on episodes in memory."""
+    """As `mpc_sgft.diagnose.diagnose`, on episodes in memory."""
     if max_effects < 1:
         raise UserError(f"max_effects={max_effects}: at least one effect must be allowed.")
     began, rng = time.perf_counter(), np.random.default_rng(seed)

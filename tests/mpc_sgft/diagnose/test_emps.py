@@ -53,11 +53,11 @@ def test_asymmetric_viscous_and_coulomb_friction_predict_both_held_out_recording
 
 
 def _verdict(folder: Path, episodes: list[Episode], spec: mujoco.MjSpec | None = None, **options: object) -> dict:
-    from mpc_sgft.diagnose.run import run_on
+    from mpc_sgft.diagnose.run import run
 
     given = {"out": None, "effects": None, "signals": None, "window": None, "held_out": None, "seed": 0}
     given |= {"uncertain": {"mass": 0.3}, "max_effects": 3, "progress": False} | options
-    return run_on(Plant(spec or mujoco.MjSpec.from_string(EMPS)), episodes, **given).as_dict()  # pyright: ignore
+    return run(Plant(spec or mujoco.MjSpec.from_string(EMPS)), episodes, **given).as_dict()  # pyright: ignore
 
 
 @pytest.mark.slow
