@@ -6,21 +6,26 @@ from numpy.typing import NDArray
 
 from envs.backends.sim import SimBackend
 
-NAME, WIDTH, HEIGHT = "side", 320, 240
+NAME = "side"
 
 
 class Camera:
-    """Pictures of a simulation from its camera, without shadows; the renderer is made for the first of them."""
+    """Pictures of a simulation from its camera, without shadows; the renderer is made for the first of them.
 
-    def __init__(self, backend: SimBackend):
-        self.backend, self._renderer = backend, None
+    Args:
+        backend: Which simulation.
+        height, width: Pixels.
+    """
+
+    def __init__(self, backend: SimBackend, *, height: int = 240, width: int = 320):
+        self.backend, self.height, self.width, self._renderer = backend, height, width, None
 
     def picture(self, sim: int) -> NDArray[np.uint8]:
-        """One simulation as it is now, [HEIGHT, WIDTH, 3]."""
+        """One simulation as it is now, [height, width, 3]."""
         model = self.backend.model
         if self._renderer is None:
             model.vis.quality.offsamples = 0
-            self._renderer = mujoco.Renderer(model, HEIGHT, WIDTH)
+            self._renderer = mujoco.Renderer(model, self.height, self.width)
             self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = False
         data = self.backend.batch.get_data(sim)
         mujoco.mj_forward(model, data)

@@ -4,11 +4,10 @@ from pathlib import Path
 
 import torch
 
+from envs.camera import Camera
 from envs.env import ControlEnv
 from mpc_sgft.errors import UserError
 from mpc_sgft.rollout import Act
-
-SIZE = (480, 640)  # [pixels] height, width
 
 
 def write_video(path: Path, env: ControlEnv, act: Act, seed: int) -> Path:
@@ -19,25 +18,23 @@ def write_video(path: Path, env: ControlEnv, act: Act, seed: int) -> Path:
     """
     try:
         import imageio.v2 as imageio
-        import mujoco
     except ImportError as error:
         raise UserError(f"video=true needs imageio: pip install 'mpc_sgft[video]' ({error})") from error
-    model = env.backend.model
+    import mujoco
+
+    camera = Camera(env.backend, height=480, width=640)
+    env.set_seed(seed)
+    state, fresh = env.reset(), torch.ones(1, dtype=torch.bool)
     try:
-        renderer = mujoco.Renderer(model, *SIZE)
+        camera.picture(0)
     except (mujoco.FatalError, RuntimeError, AttributeError) as error:
         raise UserError(
             f"MuJoCo cannot draw here ({error}). Without a screen set MUJOCO_GL=egl (or osmesa) before the command"
         ) from error
-    data = mujoco.MjData(model)
-    env.set_seed(seed)
-    state, fresh = env.reset(), torch.ones(1, dtype=torch.bool)
-    with renderer, imageio.get_writer(path, fps=round(1 / env.task.control_dt), macro_block_size=8) as film:
+    with imageio.get_writer(path, fps=round(1 / env.task.control_dt), macro_block_size=8) as film:
         for _ in range(env.task.episode_steps):
             state["action"] = act(state["observation"], fresh)
             state, fresh = env.step(state)["next"], torch.zeros(1, dtype=torch.bool)
-            data.qpos[:] = env.backend.positions()
-            mujoco.mj_forward(model, data)
-            renderer.update_scene(data, camera="side")
-            film.append_data(renderer.render())
+            film.append_data(camera.picture(0))
+    camera.close()
     return path
