@@ -4,6 +4,7 @@ from pathlib import Path
 
 import torch
 
+from envs.backends.sim import SimBackend
 from envs.camera import Camera
 from envs.env import ControlEnv
 from mpc_sgft.errors import UserError
@@ -14,8 +15,10 @@ def write_video(path: Path, env: ControlEnv, act: Act, seed: int) -> Path:
     """Film one episode of an environment of size 1 from its camera `side`, as MP4 at the control rate.
 
     Raises:
-        UserError: If imageio's extra is not installed, or MuJoCo finds no way to draw here.
+        UserError: If imageio's extra is not installed, MuJoCo cannot draw here, or no simulator is run.
     """
+    if not isinstance(env.backend, SimBackend):
+        raise UserError(f"video=true films the simulator, not {type(env.backend).__name__}: leave it out")
     try:
         import imageio.v2 as imageio
     except ImportError as error:

@@ -1,7 +1,7 @@
 """Run many deployments, side by side and resumable, and collect their learning curves into one CSV.
 
     python tools/study.py results/transfer.csv --gaps turned late ice --methods sgft tdmpc2 --seeds 0 1 2 3 4
-    python tools/study.py results/horizon.csv --gaps turned --seeds 0 1 2 --vary horizon 1 2 4 8
+    python tools/study.py results/horizon.csv --gaps late --seeds 0 1 --variants horizon=1 horizon=2 horizon=4 horizon=8
 
 Each run is `python -m mpc_sgft.deploy` in a process of its own with one thread; its folder is kept under --runs, and a
 run whose summary is there is not repeated. With several --checkpoints, seed s uses number s modulo their count.
@@ -29,21 +29,20 @@ def main() -> None:
     parser.add_argument(
         "--checkpoints", nargs="+", default=[None], help="run folders or files; default: the shipped one"
     )
-    parser.add_argument("--vary", nargs="+", default=[], metavar="WORD", help="an override's name, then its values")
+    parser.add_argument("--variants", nargs="+", default=[""], metavar="name=value", help="a run for each; '' as it is")
     parser.add_argument("--set", nargs="*", default=[], metavar="name=value", help="overrides of every run")
     parser.add_argument("--runs", type=Path, default=Path("runs/study"))
     parser.add_argument("--jobs", type=int, default=2)
     args = parser.parse_args()
-    name, values = (args.vary[0], args.vary[1:]) if args.vary else ("", [""])
-    jobs = list(itertools.product(args.seeds, args.gaps, args.methods, values))
+    jobs = list(itertools.product(args.seeds, args.gaps, args.methods, args.variants))
 
     def work(job: tuple[int, str, str, str]) -> dict | None:
-        seed, gap, method, value = job
+        seed, gap, method, variant = job
         checkpoint = args.checkpoints[seed % len(args.checkpoints)]
-        label = "-".join(str(x).replace("/", "_") for x in (args.csv.stem, gap, method, value, seed) if x != "")
+        label = "-".join(str(x).replace("/", "_") for x in (args.csv.stem, gap, method, variant, seed) if x != "")
         folder = args.runs / label
         words = [f"gap={gap}", f"method={method}", f"seed={seed}", f"run_dir={folder}", "log.rerun=false", "quiet=true"]
-        words += [f"{name}={value}"] if name else []
+        words += [variant] if variant else []
         words += [f"checkpoint={checkpoint}"] if checkpoint else []
         summary = folder / "summary.json"
         if not summary.exists():
@@ -57,7 +56,7 @@ def main() -> None:
         result = json.loads(summary.read_text())
         curve = ", ".join(f"{k}: {v:.0%}" for k, v in result["curve"].items())
         print(f"{label}: {curve} ({result['wall_seconds']:.0f} s)", flush=True)
-        return result | {"variant": f"{name}={value}" if name else ""}
+        return result | {"variant": variant}
 
     with ThreadPoolExecutor(args.jobs) as pool:
         results = [r for r in pool.map(work, jobs) if r is not None]
