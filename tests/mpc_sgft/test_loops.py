@@ -10,9 +10,10 @@ import time
 from pathlib import Path
 
 import pytest
+import torch
 from safetensors.torch import load_file
 
-from mpc_sgft import deploy
+from mpc_sgft import checkpoint, deploy
 from mpc_sgft.record import read_episode
 
 TINY = ["+experiment=debug", "task=pendulum", "log.tensorboard=false", "log.rerun=false"]
@@ -91,6 +92,20 @@ def test_deployment_freezes_what_it_must(pretrained, deployed):
     before, after = (load_file(f / "checkpoint" / "model.safetensors") for f in (pretrained, deployed))
     free = ("dynamics.", "policy_head.")
     assert all((before[k] == after[k]).all() for k in before if not k.startswith(free))
+
+
+def test_the_simulation_policy_drives_the_warm_up_and_the_planner_the_rest(pretrained, tmp_path):
+    folder = tmp_path / "run"
+    words = ["gap=pendulum_torque", "rollouts=2", "warmup=1", "transfer.action_noise=0", "transfer.updates=0"]
+    done = run("deploy", f"checkpoint={pretrained}", f"run_dir={folder}", *words)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout.splitlines()[-1])["real_rollouts"] == 2  # a warm-up rollout counts like any other
+    model, _ = checkpoint.load(pretrained)
+    for number, by_policy in ((1, True), (2, False)):
+        episode = read_episode(folder / "episodes" / f"{number:04d}.mcap").transitions
+        with torch.no_grad():
+            wanted = model.policy_prior(model.encode(torch.as_tensor(episode["observation"]).float()), None)
+        assert torch.allclose(wanted, torch.as_tensor(episode["action"]).float(), atol=1e-4) is by_policy
 
 
 def test_a_killed_deployment_loses_at_most_the_step_in_flight(pretrained, tmp_path):
