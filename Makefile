@@ -8,11 +8,11 @@ BIN := .venv/bin
 STAMP := .venv/.installed
 # Workers of the test run. One thread each: the fast suite is many small tensors.
 WORKERS ?= 2
-APT := mesa-vulkan-drivers libegl1 libegl-mesa0 libgl1-mesa-dri libosmesa6
+APT := mesa-vulkan-drivers libegl1 libegl-mesa0 libgl1-mesa-dri libosmesa6 libusb-1.0-0
 
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: help setup system demo test test-all check format clean
+.PHONY: help setup system robot demo test test-all check format clean
 
 help: ## List the targets.
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -37,6 +37,10 @@ system: ## Install the apt packages for rendering and pictures without a screen 
 	elif [ "$$(id -u)" != 0 ]; then echo "not root: tests that need a screen-less renderer will be skipped; sudo apt-get install$$missing"; \
 	else apt-get update -qq < /dev/null && DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends $$missing < /dev/null > /dev/null; \
 	  echo "installed:$$missing"; fi
+
+robot: setup ## Install the robot's client and its stand-in (Linux only).
+	@$(BIN)/python -c 'import franky, franky_sim' 2> /dev/null \
+	  || $(BIN)/python -m pip install -q --no-build-isolation -c requirements.lock -e '.[franka,franka-sim]'
 
 demo: setup ## Deploy the shipped checkpoint into a hidden gap, in simulation (minutes).
 	@$(BIN)/python -m mpc_sgft.deploy --backend sim +experiment=demo

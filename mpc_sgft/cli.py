@@ -42,6 +42,7 @@ class Command:
         overrides: The overrides scripts rely on besides the groups, {name: help}.
         values: Overrides that take one of a few words, {name: words}.
         flags: Flags of this command alone, {flag: (metavar, help)}.
+        switches: Flags of this command alone that take no value, {flag: help}.
     """
 
     name: str
@@ -50,6 +51,7 @@ class Command:
     overrides: Mapping[str, str] = field(default_factory=dict)
     values: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     flags: Mapping[str, tuple[str, str]] = field(default_factory=dict)
+    switches: Mapping[str, str] = field(default_factory=dict)
 
 
 COMMON = {
@@ -161,6 +163,8 @@ def _parse(command: Command, args: list[str]) -> tuple[argparse.Namespace, list[
     flags = parser.add_argument_group("flags")
     for flag, (metavar, text) in {**command.flags, **FLAGS}.items():
         flags.add_argument(flag, metavar=metavar, help=text)
+    for flag, text in command.switches.items():
+        flags.add_argument(flag, action="store_true", help=text)
     flags.add_argument("--resume", metavar="DIR", help="go on with this run folder exactly where it stopped")
     flags.add_argument("--quiet", action="store_true", help="no progress bar, no table")
     flags.add_argument("--config", action="store_true", help="print the composed config and stop")
@@ -182,6 +186,7 @@ def _parse(command: Command, args: list[str]) -> tuple[argparse.Namespace, list[
         value = getattr(known, flag[2:].replace("-", "_"))
         if value is not None:
             mapped.append(f"{flag[2:]}={_quoted(value) if flag in PATHS else value}")
+    mapped += [f"{flag[2:]}=true" for flag in command.switches if getattr(known, flag[2:].replace("-", "_"))]
     if known.quiet:
         mapped.append("quiet=true")
     for text in list(rest):

@@ -19,7 +19,7 @@ from omegaconf.errors import OmegaConfBaseException
 from mpc_sgft import choices
 from mpc_sgft.errors import UserError, unknown
 
-ALIASES = {"horizon": "planner.horizon"}
+ALIASES = {"horizon": "planner.horizon", "robot-ip": "backend.robot_ip", "dry-run": "backend.dry_run"}
 OPEN = ("gap.effects.", "randomize.")  # mappings that may gain keys on the command line
 FORM = re.compile(r"(?P<sign>\+\+|\+|~)?(?P<key>[A-Za-z_][\w./@-]*)(?P<rest>=.*)?", re.DOTALL)
 

@@ -17,7 +17,11 @@ COMMAND = cli.Command(
         "horizon": "steps the planner looks ahead (planner.horizon)",
     },
     values={"method": ("sgft", "tdmpc2", "zero_shot")},
-    flags={"--backend": ("sim|franka", "where actions go: MuJoCo with a hidden gap, or the robot")},
+    flags={
+        "--backend": ("sim|franka", "where actions go: MuJoCo with a hidden gap, or the robot"),
+        "--robot-ip": ("IP|stand-in", "the robot's address (--backend franka); stand-in: a simulated one"),
+    },
+    switches={"--dry-run": "connect, look, plan and check, but do not move (--backend franka)"},
 )
 
 

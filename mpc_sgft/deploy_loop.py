@@ -2,12 +2,14 @@
 
 import json
 import time
+from contextlib import closing
 from typing import Any
 
 from omegaconf import DictConfig
 
+from envs.backends.base import BackendError
 from envs.env import ControlEnv
-from mpc_sgft import build, checkpoint, run_folder
+from mpc_sgft import build, checkpoint, robot, run_folder
 from mpc_sgft.agent import Agent
 from mpc_sgft.audit import audit, write_audit
 from mpc_sgft.drive import Rollout, drive, from_episode
@@ -15,7 +17,7 @@ from mpc_sgft.errors import Stopped, UserError
 from mpc_sgft.log import GrowingTable, MetricLogger, progress
 from mpc_sgft.pretrain_loop import EVAL_SEED, StopRequest
 from mpc_sgft.record import read_episode
-from mpc_sgft.rollout import Score, collect, planner_policy, score
+from mpc_sgft.rollout import Score, collect, planner_policy, score, score_of
 from mpc_sgft.show import DeployViewer
 from mpc_sgft.transfer import Transfer, open_loop_error
 from planners.policy import PolicyPlanner
@@ -25,22 +27,26 @@ REAL_SEED = 2_000_000  # real rollouts never share a seed with evaluation or pre
 
 def deploy(cfg: DictConfig) -> int:
     """Adapt a pretrained agent with real rollouts; returns the exit code."""
-    if cfg.backend.name == "franka":
-        raise UserError(
-            "--backend franka is not in this version. Rehearse with --backend sim and a gap, e.g. gap=turned."
-        )
     agent, _ = build.load_agent(cfg)
-    env = build.make_env(cfg, 1)
-    judge = build.make_env(cfg, cfg.eval_episodes)
-    build.check_fits(agent.model, env)
-    run = Deployment(cfg, agent, env, judge)
-    return run.loop()
+    real = cfg.backend.name == "franka"
+    env = robot.make_env(cfg) if real else build.make_env(cfg, 1)
+    with closing(env.backend):
+        build.check_fits(agent.model, env)
+        if real:
+            robot.connect(env)
+        if real and cfg.backend.dry_run:
+            return robot.dry_run(cfg, agent.model, env)
+        run = Deployment(cfg, agent, env, None if real else build.make_env(cfg, cfg.eval_episodes))
+        try:
+            return run.loop()
+        except BackendError as error:
+            raise UserError(f"{error} {run.how_to_go_on()}") from error
 
 
 class Deployment:
-    """State of one deployment and its folder."""
+    """State of one deployment and its folder. Without a judge, the real rollouts themselves are the measure."""
 
-    def __init__(self, cfg: DictConfig, agent: Agent, env: ControlEnv, judge: ControlEnv):
+    def __init__(self, cfg: DictConfig, agent: Agent, env: ControlEnv, judge: ControlEnv | None):
         self.cfg, self.env, self.judge = cfg, env, judge
         self.folder = run_folder.start(cfg)
         (self.folder / "episodes").mkdir(exist_ok=True)
@@ -62,6 +68,7 @@ class Deployment:
             memory=t.gate_memory,
         )
         self.state: dict[str, Any] = {"rollouts": 0, "aborted": 0, "scores": {}, "seconds": 0.0, "successes": 0}
+        self.state["outcomes"] = []  # (success, return) of each real rollout
         if cfg.resume is not None:
             self._resume()
         self.logger = MetricLogger(
@@ -79,7 +86,7 @@ class Deployment:
     def loop(self) -> int:
         """Run what is left, and write the summary."""
         cfg, stop, table = self.cfg, StopRequest("rollout"), None if self.cfg.quiet else GrowingTable()
-        if not self.state["scores"]:
+        if self.judge and not self.state["scores"]:
             self._evaluate(table, {})
             self._save()
         if self.viewer:
@@ -91,10 +98,13 @@ class Deployment:
             number = self.state["rollouts"] + 1
             rollout = self._rollout(number)
             metrics = self._measure(rollout, number)
-            metrics |= self.transfer.learn(rollout.steps[~rollout.steps["next", "invalid"][:, 0]])
+            valid = rollout.steps[~rollout.steps["next", "invalid"][:, 0]]
+            if len(valid) >= cfg.train.replay.slice_len:
+                metrics |= self.transfer.learn(valid)
             self.state["rollouts"] = number
             self.state["aborted"] += rollout.aborted is not None
             self.state["successes"] += rollout.success
+            self.state["outcomes"].append((rollout.success, metrics["real_return"]))
             if number % cfg.eval_every == 0 or number == cfg.rollouts:
                 self._evaluate(table, metrics)
             self.logger.log(number, metrics)
@@ -102,9 +112,14 @@ class Deployment:
             bar.update(1)
             bar.set_postfix(real_success=f"{self.state['successes']}/{number}")
             if stop.asked:
-                raise Stopped(f"saved after {number} rollouts. Go on: python -m mpc_sgft.deploy --resume {self.folder}")
+                raise Stopped(self.how_to_go_on())
         bar.close()
         return self._finish()
+
+    def how_to_go_on(self) -> str:
+        """What is saved, and the command that continues."""
+        done = self.state["rollouts"]
+        return f"saved after {done} rollouts. Go on: python -m mpc_sgft.deploy --resume {self.folder}"
 
     def _rollout(self, number: int) -> Rollout:
         """The next real rollout; one that a killed process recorded is used as it is, not driven again."""
@@ -151,8 +166,7 @@ class Deployment:
         return metrics
 
     def _evaluate(self, table: GrowingTable | None, metrics: dict[str, float]) -> None:
-        act = planner_policy(self.transfer.acting, self.planner, EVAL_SEED)
-        result: Score = score(collect(self.judge, act, seed=EVAL_SEED))
+        result = self._score()
         self.state["scores"][self.state["rollouts"]] = result._asdict()
         metrics |= {"success": result.success, "return": result.episode_return}
         if self.viewer:
@@ -168,6 +182,14 @@ class Deployment:
                 seconds=time.monotonic() - self.began,
             )
 
+    def _score(self) -> Score:
+        """Of evaluation episodes; without a judge, of the real rollouts since the last time."""
+        if self.judge is None:
+            latest = self.state["outcomes"][max(self.state["scores"], default=0) :]
+            return score_of(*zip(*latest, strict=True))
+        act = planner_policy(self.transfer.acting, self.planner, EVAL_SEED)
+        return score(collect(self.judge, act, seed=EVAL_SEED))
+
     def _save(self) -> None:
         self.state["seconds"] = time.monotonic() - self.began
         path = self.folder / "checkpoint"
@@ -179,7 +201,7 @@ class Deployment:
         path = self.folder / "checkpoint" / "state.pt"
         if path.exists():
             stored = checkpoint.load_state(path)
-            self.state = stored["loop"]
+            self.state |= stored["loop"]
             self.transfer.load_state_dict(stored["transfer"])
 
     def _finish(self) -> int:
@@ -198,15 +220,16 @@ class Deployment:
             "seed": cfg.seed,
             "real_rollouts": self.state["rollouts"],
             "aborted_rollouts": self.state["aborted"],
-            "zero_shot_success": scores[0]["success"],
+            "zero_shot_success": scores[0]["success"] if 0 in scores else None,
             "final_success": scores[max(scores)]["success"],
             "final_interval": [scores[max(scores)]["success_low"], scores[max(scores)]["success_high"]],
-            "evaluation_episodes": cfg.eval_episodes,
+            "evaluation_episodes": scores[max(scores)]["episodes"],
             "rollouts_to_90": min(reached) if reached else None,
             "curve": {str(k): s["success"] for k, s in scores.items()},
             "horizon": cfg.planner.horizon,
             "frozen_sha256": self.frozen,
             "wall_seconds": round(time.monotonic() - self.began, 1),
+            "robot": self.env.backend.report() if self.judge is None else None,
             "rrd": str(self.folder / "run.rrd") if self.viewer else None,
         }
         (self.folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")

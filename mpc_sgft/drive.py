@@ -79,7 +79,7 @@ def drive(
             action = plan.action.cpu() + noise * torch.randn(plan.action.shape, generator=noise_generator)
             state["action"] = action.clamp(-1, 1)
             row, state = _step(env, state, number, t)
-            writer.step(_transition(row, t, task.control_dt), env.backend.samples())
+            writer.step({**_transition(row, t, task.control_dt), "note": env.backend.note}, env.backend.samples())
             rows.append(row[0])
             plans.append(plan.mean[0].cpu())
             values.append(plan.value[0].cpu())
@@ -88,7 +88,7 @@ def drive(
             if keep and plan.candidates is not None and plan.candidate_values is not None:
                 candidates.append((t, plan.candidates[0].cpu(), plan.candidate_values[0].cpu()))
             if row["next", "invalid"].item():
-                aborted = "physics unstable"
+                aborted = env.backend.note or "the step is invalid"
             if row["next", "done"].item():
                 break
         steps = cast(TensorDict, TensorDict.stack(rows))

@@ -44,7 +44,8 @@ def unknown(kind: str, name: str, valid: Iterable[str], where: str = "") -> User
 def from_config(what: str) -> Iterator[None]:
     """Report wrong values found while building objects from the config as the user's error.
 
-    Wrap construction only, never a loop: inside, ValueError, TypeError and KeyError become UserError.
+    Wrap construction only, never a loop: inside, ValueError, TypeError and KeyError become UserError; other errors of
+    the objects themselves come out as they are.
 
     Args:
         what: What is being built, e.g. "gap" or "planner".
@@ -58,9 +59,11 @@ def from_config(what: str) -> Iterator[None]:
         raise UserError(f"{what}: {err}") from err
     except Exception as err:
         cause = err.__cause__
-        if type(err).__name__ == "InstantiationException" and isinstance(cause, ValueError | TypeError | KeyError):
+        if type(err).__name__ != "InstantiationException" or cause is None:
+            raise
+        if isinstance(cause, ValueError | TypeError | KeyError):
             raise UserError(f"{what}: {cause}") from err
-        raise
+        raise cause from err
 
 
 def disk_error(err: OSError) -> str | None:

@@ -16,6 +16,8 @@ CHUNK = 100  # episodes side by side
 
 def evaluate(cfg: DictConfig) -> int:
     """Run the episodes, print and save the result as JSON; returns the exit code."""
+    if cfg.backend.name != "sim":
+        raise UserError("evaluate runs in simulation. On the robot: deploy --backend franka method=zero_shot.")
     env = build.make_env(cfg, min(cfg.episodes, CHUNK), randomised=True)
     if cfg.episodes % env.batch_size[0]:
         raise UserError(f"episodes={cfg.episodes}: more than {CHUNK} must be a multiple of {CHUNK}.")

@@ -1,6 +1,6 @@
 """Whole episodes, all environments in step: for collecting, and for measuring success."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple, cast
 
 import numpy as np
@@ -62,10 +62,15 @@ def score(episodes: TensorDict) -> Score:
     last = first.long().cumsum(1).argmax(1)  # [N] index of the first episode's last step
     rows = torch.arange(len(last))
     success = episodes["next", "success"][rows, last, 0]
-    n, k = len(success), int(success.sum())
-    interval = binomtest(k, n).proportion_ci(method="wilson")
     returns = (episodes["next", "reward"][..., 0] * first).sum(1)
-    return Score(n, k, k / n, float(interval.low), float(interval.high), float(returns.mean()))
+    return score_of(success.tolist(), returns.tolist())
+
+
+def score_of(successes: Sequence[bool], returns: Sequence[float]) -> Score:
+    """The score of episodes of which only the outcome is known; at least one."""
+    n, k = len(successes), sum(successes)
+    interval = binomtest(k, n).proportion_ci(method="wilson")
+    return Score(n, k, k / n, float(interval.low), float(interval.high), float(np.mean(returns)))
 
 
 def planner_policy(model: WorldModel, planner, seed: int, *, explore: bool = False) -> Act:

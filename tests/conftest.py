@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
 from collections.abc import Callable
+from ctypes.util import find_library
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch is imported: workers must not fight over the cores
@@ -53,3 +57,25 @@ def data_dir() -> Path:
         if path.is_dir():
             return path
     pytest.skip(f"no measured data in {candidates[0]}; set MPC_SGFT_DATA to the folder that holds them")
+
+
+@pytest.fixture(scope="session")
+def render(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., tuple[np.ndarray, np.ndarray]]:
+    """render(shots, ...): what a camera sees of a table with a tag and pucks (tests/render.py); color [n, H, W, 3],
+    depth [n, H, W] m. Skips where nothing can draw without a screen."""
+    pytest.importorskip("cv2", reason="needs the camera extra")
+    found = {"egl": find_library("EGL"), "osmesa": find_library("OSMesa")}
+    name = next((name for name, library in found.items() if library), None)
+    if name is None:
+        pytest.skip("needs libegl1 or libosmesa6 (make system)")
+
+    def draw(shots: list[dict[str, Any]], **settings: Any) -> tuple[np.ndarray, np.ndarray]:
+        path = tmp_path_factory.mktemp("render") / "shots.npz"
+        order = json.dumps({"shots": shots, **settings}, default=np.ndarray.tolist)
+        line, env = [sys.executable, str(ROOT / "tests/render.py"), str(path)], {**os.environ, "MUJOCO_GL": name}
+        done = subprocess.run(line, input=order, env=env, capture_output=True, text=True, timeout=120)
+        assert done.returncode == 0, done.stderr
+        with np.load(path) as pictures:
+            return pictures["color"], pictures["depth"]
+
+    return draw

@@ -9,6 +9,10 @@ from numpy.typing import NDArray
 from envs.task import AbstractTask, Array
 
 
+class BackendError(Exception):
+    """A robot cannot be used, or not any longer; it is at rest. The message says why and what to do next."""
+
+
 class Outcome(NamedTuple):
     """What one control period brought, a row each environment."""
 
@@ -27,11 +31,13 @@ class Backend(Protocol):
         task: What is done.
         num_envs: N.
         counters: How often what went wrong since the beginning; `unstable` counts failed physics.
+        note: Why the last period of the first environment is invalid, or why less was sent than asked; often empty.
     """
 
     task: AbstractTask
     num_envs: int
     counters: Counter[str]
+    note: str
 
     def seed(self, seed: int) -> None:
         """Make everything random from here on a function of `seed`."""
@@ -56,4 +62,8 @@ class Backend(Protocol):
 
     def describe(self) -> dict[str, object]:
         """Names of joints and actuators, for recordings; nothing of what is hidden."""
+        ...
+
+    def close(self) -> None:
+        """Bring everything to rest and let go of it; a second call does nothing."""
         ...

@@ -76,6 +76,7 @@ class SimBackend:
         self.dry = LoadFriction(self.batch, nominal, self.effects)
         self.actuators = [nominal.actuator(i).name for i in range(nominal.nactuator)]
         self.counters: Counter[str] = Counter()
+        self.note = ""
         self.slots = [_history_values(self.model, i) for i in range(self.model.nu)]
         self.record = ("qpos", "qvel", "actuator_force")
         self.target = np.zeros((num_envs, task.start(np.random.default_rng(0)).target.shape[1]))
@@ -165,6 +166,9 @@ class SimBackend:
         joints = [self.nominal.joint(i).name for i in range(self.nominal.njnt)]
         return {"joint_names": joints, "actuator_names": self.actuators}
 
+    def close(self) -> None:
+        """Nothing moves by itself here."""
+
     def _change(self, told: Array) -> Array:
         """What effects at named actuators make of control signals [T, nu]; the others act on the action."""
         for effect in self.effects:
@@ -218,6 +222,7 @@ class SimBackend:
             self.counters["unstable"] += 1
             log.warning("environment %d: physics unstable (%s); the episode ends and the step is dropped", i, reason)
         self.unstable = unstable
+        self.note = "physics unstable" if unstable[0] else ""
         return unstable.copy()
 
 

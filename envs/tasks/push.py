@@ -1,5 +1,7 @@
 """Push a puck to a line with an FR3: four numbers seen, two commanded."""
 
+from collections.abc import Sequence
+
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
@@ -7,7 +9,7 @@ from numpy.typing import NDArray
 from envs import fr3, kinematics
 from envs.task import AbstractTask, Array, Start, whole_steps
 
-ORIGIN = np.array([0.20, 0.0, -0.15])  # [m] origin of the task frame on the table, in the frame of the robot's base
+ORIGIN = np.array([0.20, 0.0, -0.15])  # [m] origin of the task frame on the table, base frame, unless told otherwise
 PUCK_RADIUS, PUCK_HALF_HEIGHT = 0.025, 0.015  # [m]
 TOOL_RADIUS, TOOL_LENGTH, TOOL_HEIGHT = 0.010, 0.15, 0.012  # [m]; the tip is kept this far above the table
 REACH = 0.78  # [m] from the base axis: beyond it the arm is stretched
@@ -36,6 +38,7 @@ class Push(AbstractTask):
     name = "push"
     observation_names = ("tip_x", "tip_y", "puck_x", "puck_y")
     arm_joints = (0, 1, 3)  # commanded with control="joint"
+    rest, tool_length = REST, TOOL_LENGTH
 
     def __init__(
         self,
@@ -53,6 +56,7 @@ class Push(AbstractTask):
         puck_mass: float,
         puck_friction: float,
         start_noise: float,
+        origin: Sequence[float] = tuple(ORIGIN),
     ):
         if control not in ("cartesian", "joint"):
             raise ValueError(f"control={control!r}; allowed: cartesian, joint")
@@ -63,6 +67,7 @@ class Push(AbstractTask):
         self.goal_x, self.tolerance = goal_x, tolerance
         self.puck_x, self.puck_y, self.puck_mass, self.puck_friction = puck_x, puck_y, puck_mass, puck_friction
         self.start_noise = start_noise
+        self.origin = np.array(origin, float)
         self._home: Array | None = None
 
     def spec(self) -> mujoco.MjSpec:
@@ -82,7 +87,7 @@ class Push(AbstractTask):
             name="table",
             type=mujoco.mjtGeom.mjGEOM_PLANE,
             size=[*(TABLE_HIGH - TABLE_LOW) / 2, 0.05],
-            pos=[*(ORIGIN[:2] + (TABLE_LOW + TABLE_HIGH) / 2), ORIGIN[2]],
+            pos=[*(self.origin[:2] + (TABLE_LOW + TABLE_HIGH) / 2), self.origin[2]],
             rgba=[0.80, 0.74, 0.64, 1],
             contype=fr3.TABLE_BIT,
             conaffinity=0,
@@ -91,7 +96,7 @@ class Push(AbstractTask):
             name="goal",
             type=mujoco.mjtGeom.mjGEOM_BOX,
             size=[self.tolerance, 0.4, 0.0005],
-            pos=[ORIGIN[0] + self.goal_x, 0, ORIGIN[2] + 0.0005],
+            pos=[self.origin[0] + self.goal_x, 0, self.origin[2] + 0.0005],
             rgba=[0.2, 0.65, 0.35, 0.6],
             contype=0,
             conaffinity=0,
@@ -101,7 +106,7 @@ class Push(AbstractTask):
             actuator.nsample, actuator.delay = NSAMPLE, 0.0
             actuator.dyntype, actuator.actearly = mujoco.mjtDyn.mjDYN_FILTEREXACT, 1
             actuator.dynprm[0] = 1e-6
-        puck = world.add_body(name="puck", pos=[0.5, 0, ORIGIN[2] + PUCK_HALF_HEIGHT])
+        puck = world.add_body(name="puck", pos=[0.5, 0, self.origin[2] + PUCK_HALF_HEIGHT])
         puck.add_freejoint(name="puck")
         puck.add_geom(
             name="puck",
@@ -116,6 +121,10 @@ class Push(AbstractTask):
         )
         return spec
 
+    def held(self, qpos: Array) -> Array:
+        """The command [N, C] that leaves the arm where it is, for joint positions [N, nq]."""
+        return self.observe(qpos, qpos)[:, :2] if self.control == "cartesian" else qpos[:, :7].copy()
+
     def home(self) -> Array:
         """Joint angles [1, 7] with the tip behind every puck start; computed once."""
         if self._home is None:
@@ -128,7 +137,7 @@ class Push(AbstractTask):
     def start(self, rng: np.random.Generator) -> Start:
         xy = np.array([[-0.07, 0.0]]) + rng.uniform(-self.start_noise, self.start_noise, (1, 2))
         q = kinematics.inverse(self.home(), self._tip_target(xy), REST, TOOL_LENGTH)
-        puck = ORIGIN + [rng.uniform(*self.puck_x), rng.uniform(*self.puck_y), PUCK_HALF_HEIGHT]
+        puck = self.origin + [rng.uniform(*self.puck_x), rng.uniform(*self.puck_y), PUCK_HALF_HEIGHT]
         yaw = rng.uniform(-np.pi, np.pi)
         qpos = np.concatenate([q[0], puck, [np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)]])[None]
         return Start(qpos=qpos, qvel=np.zeros((1, 13)), target=xy if self.control == "cartesian" else q)
@@ -136,13 +145,13 @@ class Push(AbstractTask):
     def move(self, target: Array, action: Array) -> Array:
         if self.control == "cartesian":
             xy = np.clip(target + self.step_size * action, WORKSPACE_LOW, WORKSPACE_HIGH)
-            from_base = xy + ORIGIN[:2]
+            from_base = xy + self.origin[:2]
             far = np.linalg.norm(from_base, axis=1, keepdims=True)
-            return from_base * np.minimum(1.0, REACH / far) - ORIGIN[:2]
+            return from_base * np.minimum(1.0, REACH / far) - self.origin[:2]
         moved = target.copy()
         moved[:, self.arm_joints] += self.joint_step * action
         moved = np.clip(moved, fr3.Q_MIN + 0.1, fr3.Q_MAX - 0.1)
-        tip = kinematics.tip_position(moved, TOOL_LENGTH) - ORIGIN
+        tip = kinematics.tip_position(moved, TOOL_LENGTH) - self.origin
         inside = ((tip[:, :2] >= WORKSPACE_LOW - 0.05) & (tip[:, :2] <= WORKSPACE_HIGH + 0.05)).all(1)
         return np.where((inside & (tip[:, 2] > 0.005) & (tip[:, 2] < 0.3))[:, None], moved, target)
 
@@ -153,7 +162,7 @@ class Push(AbstractTask):
 
     def observe(self, qpos: Array, qvel: Array) -> Array:
         tip = kinematics.tip_position(qpos[:, :7], TOOL_LENGTH)
-        return np.concatenate([tip[:, :2], qpos[:, 7:9]], 1) - np.tile(ORIGIN[:2], 2)
+        return np.concatenate([tip[:, :2], qpos[:, 7:9]], 1) - np.tile(self.origin[:2], 2)
 
     def reward(self, observation: Array, action: Array) -> Array:
         tip, puck = observation[:, :2], observation[:, 2:]
@@ -185,10 +194,10 @@ class Push(AbstractTask):
 
     def points(self, observation: Array) -> dict[str, Array]:
         def lift(xy: Array, height: float) -> Array:
-            return np.concatenate([xy, np.full_like(xy[..., :1], height)], -1) + ORIGIN
+            return np.concatenate([xy, np.full_like(xy[..., :1], height)], -1) + self.origin
 
         xy = observation[..., :4]
         return {"tip": lift(xy[..., :2], TOOL_HEIGHT), "object": lift(xy[..., 2:4], PUCK_HALF_HEIGHT)}
 
     def _tip_target(self, xy: Array) -> Array:
-        return np.concatenate([xy, np.full((len(xy), 1), TOOL_HEIGHT)], 1) + ORIGIN
+        return np.concatenate([xy, np.full((len(xy), 1), TOOL_HEIGHT)], 1) + self.origin

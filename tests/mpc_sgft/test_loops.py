@@ -144,7 +144,7 @@ def test_the_scripted_pendulum_swings_up(tmp_path):
 @pytest.mark.parametrize(
     ("words", "says"),
     [
-        (["backend=franka"], "franka"),
+        (["backend=franka"], "task=pendulum cannot run on the robot"),
         (["checkpoint=nowhere"], "nowhere"),
         (["task=push"], "task"),
         (["gap.effects.actuator_gain.gain=99"], "-5"),

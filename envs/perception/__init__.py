@@ -1,0 +1,1 @@
+"""Where the object is, measured: a fixed pose, the stand-in, or cameras."""

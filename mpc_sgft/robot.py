@@ -1,0 +1,134 @@
+"""From a config to a robot: the arm, its stand-in, what sees the object, and a rehearsal without moving."""
+
+import json
+import sys
+from typing import Any
+
+import numpy as np
+from hydra.utils import instantiate
+from omegaconf import DictConfig, OmegaConf
+
+from envs.backends.arm import Arm
+from envs.backends.base import BackendError
+from envs.backends.franka import FrankaBackend
+from envs.backends.limits import Limits
+from envs.backends.rig import Place, Rig
+from envs.backends.safety import Gate
+from envs.backends.stream import SAMPLE_DT
+from envs.env import ControlEnv
+from envs.perception.base import Perception, PerceptionError
+from envs.stand_in.client import StandIn
+from mpc_sgft import build, run_folder
+from mpc_sgft.drive import drive
+from mpc_sgft.errors import UserError, from_config
+from mpc_sgft.world_model import WorldModel
+
+STAND_IN = "stand-in"
+
+
+def make_env(cfg: DictConfig) -> ControlEnv:
+    """The task on the robot of `cfg.backend`, not connected yet; a stand-in is started here.
+
+    Raises:
+        UserError: For a task without a robot, a gap, a missing address, perception that does not go with it, a number
+            that is not allowed, or a missing package.
+    """
+    on_robot = cfg.task.get("on_robot")
+    if on_robot is None:
+        raise UserError(f"task={cfg.chosen.task} cannot run on the robot: configs/task/ gives it no on_robot.")
+    if cfg.gap.effects:
+        raise UserError("a gap is what a simulator lacks; the robot has its own. Leave gap= out with --backend franka.")
+    settings: Any = OmegaConf.to_container(cfg.backend, resolve=True)
+    ip, clock = settings["robot_ip"], settings["clock"]
+    if ip is None:
+        raise UserError("--backend franka needs --robot-ip IP, or --robot-ip stand-in to rehearse without a robot.")
+    if cfg.perception.name == "stand_in" and ip != STAND_IN:
+        raise UserError(
+            "perception=stand_in sees the stand-in's table alone. Choose how the object is seen: perception=..."
+        )
+    if ip != STAND_IN and clock == "robot":
+        raise UserError("backend.clock=robot is for the stand-in. A robot needs real time: leave backend.clock= out.")
+    if ip == STAND_IN and cfg.perception.name != "stand_in":
+        raise UserError(f"the stand-in has no camera for perception={cfg.perception.name}. Leave perception= out.")
+    with from_config("task"):
+        task = instantiate({**cfg.task.env, **on_robot}, _convert_="all")
+    with from_config("backend.limits"):
+        limits = Limits(**settings["limits"])
+    try:
+        with from_config("backend.arm"):
+            arm = Arm(str(ip), **settings["arm"])
+    except BackendError as error:
+        raise UserError(str(error)) from error
+
+    def look() -> tuple[Perception, Place | None]:
+        if ip == STAND_IN:
+            stand_in = StandIn(task)
+            arm.ip = stand_in.ip
+            return stand_in, stand_in.scene.place
+        with from_config("perception"):
+            made = {key: value for key, value in cfg.perception.items() if key != "name"}
+            return instantiate(made, _convert_="all"), ask_person if cfg.perception.name != "fixed" else None
+
+    with from_config("backend"):
+        gate = Gate(limits, tool_length=task.tool_length, sample_dt=SAMPLE_DT)
+        clock = clock or ("robot" if ip == STAND_IN else "wall")
+        rig = Rig(arm, look, gate, clock=clock, patience=settings["patience"], dry_run=settings["dry_run"])
+        backend = FrankaBackend(task, rig, safe_tip=settings["safe_tip"], reset_speed=settings["reset_speed"])
+    return ControlEnv(backend, history=cfg.task.history)
+
+
+def connect(env: ControlEnv) -> None:
+    """Reach the robot.
+
+    Raises:
+        UserError: Why not, and what to check.
+    """
+    try:
+        env.backend.open()  # type: ignore[attr-defined]
+    except (BackendError, PerceptionError) as error:
+        raise UserError(str(error)) from error
+
+
+def dry_run(cfg: DictConfig, model: WorldModel, env: ControlEnv) -> int:
+    """One episode in which the arm stays where it is: everything is measured, planned, checked and recorded."""
+    folder = run_folder.start(cfg)
+    (folder / "episodes").mkdir(exist_ok=True)
+    build.prepare_process(cfg)
+    try:
+        rollout = drive(
+            env,
+            model,
+            build.make_planner(cfg, env.action_dim),
+            folder / "episodes" / "dry_run.mcap",
+            number=0,
+            seed=cfg.seed,
+            noise=0.0,
+            candidate_steps=(),
+        )
+    except BackendError as error:
+        raise UserError(str(error)) from error
+    assert rollout.plan_ms is not None
+    summary = {
+        "dry_run": True,
+        "steps": len(rollout.plan_ms),
+        "aborted": rollout.aborted,
+        "planner_ms_median": round(float(np.median(rollout.plan_ms)), 1),
+        "planner_ms_max": round(float(np.max(rollout.plan_ms)), 1),
+        "first_observation": [round(float(x), 3) for x in rollout.steps["observation"][0, : env.raw_dim]],
+        "robot": env.backend.report(),  # type: ignore[attr-defined]
+    }
+    (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
+    print(json.dumps(summary))
+    return 0
+
+
+def ask_person(position: Any) -> None:
+    """Have somebody put the object somewhere, and wait until they say that it is there.
+
+    Raises:
+        BackendError: If nobody can answer.
+    """
+    x, y = (round(float(v), 2) for v in position[:2])
+    if not sys.stdin.isatty():
+        raise BackendError("somebody must put the object in its place, and no terminal is attached to ask them")
+    input(f"\nput the object at x = {x} m, y = {y} m from the robot's base, step back, then press Enter ")

@@ -1,0 +1,74 @@
+"""A robot that speaks the real protocol, and a backend on it, from the numbers in configs/.
+
+Periods are counted on the robot's clock, so that a busy computer makes these tests slow and not wrong; ages of states
+and sights, which are on the wall's clock, are generous for the same reason.
+"""
+
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import pytest
+import yaml
+
+from envs.backends.arm import Arm
+from envs.backends.franka import FrankaBackend
+from envs.backends.limits import Limits
+from envs.backends.rig import Rig
+from envs.backends.safety import Gate
+from envs.backends.stream import SAMPLE_DT
+from envs.stand_in.client import StandIn
+from envs.tasks.push import Push
+from mpc_sgft.choices import CONFIG_DIR
+
+SLOW = {"state_age": 1.0, "detection_age": 0.4}
+
+
+@pytest.fixture(scope="session")
+def robot_config() -> dict:
+    """configs/backend/franka.yaml."""
+    return yaml.safe_load((CONFIG_DIR / "backend" / "franka.yaml").read_text())
+
+
+@pytest.fixture(scope="session")
+def robot_push() -> Push:
+    """Push as it stands in front of a robot."""
+    settings = yaml.safe_load((CONFIG_DIR / "task" / "push.yaml").read_text())
+    env = {**settings["env"], **settings["on_robot"]}
+    env.pop("_target_")
+    return Push(**env)
+
+
+@pytest.fixture
+def stand_in(robot_push: Push) -> Iterator[StandIn]:
+    pytest.importorskip("franky", reason="needs pip install mpc_sgft[franka]")
+    pytest.importorskip("franky_sim", reason="needs pip install mpc_sgft[franka-sim]")
+    running = StandIn(robot_push)
+    yield running
+    running.close()
+
+
+@pytest.fixture
+def on_stand_in(robot_push: Push, robot_config: dict) -> Iterator[Callable[..., FrankaBackend]]:
+    """on_stand_in(stand_in, **limits): a backend that is reset; the test's end closes it."""
+    made = []
+
+    def make(stand_in: StandIn, **changes: float) -> FrankaBackend:
+        limits = Limits(**{**robot_config["limits"], **SLOW, **changes})
+        gate = Gate(limits, tool_length=robot_push.tool_length, sample_dt=SAMPLE_DT)
+        arm = Arm(stand_in.ip, **{**robot_config["arm"], "timeout": 30})
+        look = lambda: (stand_in, stand_in.scene.place)  # noqa: E731
+        rig = Rig(arm, look, gate, clock="robot", patience=1.0, dry_run=False)
+        backend = FrankaBackend(robot_push, rig, safe_tip=robot_config["safe_tip"], reset_speed=0.4)
+        backend.pace.measure = rig.clock.now
+        made.append(backend)
+        backend.reset(np.arange(1))
+        return backend
+
+    yield make
+    for backend in made:
+        backend.close()
+
+
+@pytest.fixture
+def robot(stand_in: StandIn, on_stand_in: Callable[..., FrankaBackend]) -> FrankaBackend:
+    return on_stand_in(stand_in)

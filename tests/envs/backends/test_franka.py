@@ -1,0 +1,65 @@
+"""The real client against a controller that speaks the robot's protocol: it moves as told, and no further."""
+
+import time
+
+import numpy as np
+import pytest
+
+from envs.backends.arm import Arm
+from envs.backends.base import BackendError
+from envs.backends.franka import FrankaBackend
+from envs.backends.safety import NotSafe
+from envs.stand_in.client import StandIn
+
+RIGHT = np.array([[0.0, 0.5]])
+
+
+def test_the_arm_moves_as_told_and_everything_is_recorded(robot: FrankaBackend) -> None:
+    first, rows = robot._observation.copy(), []
+    for _ in range(4):
+        out = robot.send(RIGHT)
+        rows.append(robot.samples())
+        assert not out.invalid[0] and robot.note == ""
+        np.testing.assert_allclose(out.action_sent, RIGHT)
+    moved = out.observation - first
+    assert moved[0, 1] > 0.05 and abs(moved[0, 0]) < 0.02  # four times half of 5 cm, less what compliance holds back
+    times = np.concatenate([r["time"] for r in rows if r])
+    assert (np.diff(times) > 0).all() and len(times) / (times[-1] - times[0]) > 100  # [Hz]
+    assert robot.pace.report()["period_median_s"] == pytest.approx(0.2, abs=0.005)
+
+
+def test_a_move_out_of_the_box_is_cut_and_says_so(stand_in: StandIn, on_stand_in) -> None:
+    robot = on_stand_in(stand_in, high=(0.82, 0.08, 0.10))
+    for _ in range(4):
+        out = robot.send(2 * RIGHT)
+        assert not out.invalid[0] and robot.gate.tip(robot.rig.stream.told)[1] <= 0.08
+    assert robot.note == "limited: workspace box" and out.action_sent[0, 1] < 0.5
+    assert robot.report()["limited"] >= 2
+
+
+def test_a_joint_near_its_range_does_not_come_nearer(robot: FrankaBackend) -> None:
+    """Joint 7 is told to go beyond its range: the gate cuts it, the arm stays 0.1 rad away and is not stopped."""
+    stream, end = robot.rig.stream, robot.gate.q_high[6]
+    for _ in range(12):
+        start = stream.hold()
+        goal = start + [0, 0, 0, 0, 0, 0, 0.2]
+        step = robot.gate.step(start[None], goal[None], robot.samples_per_step)
+        robot.rig.follow(step.path[0])
+    assert step.note == ["joint range"] and stream.told[6] == pytest.approx(end, abs=0.02)
+    assert stream.state.q[6] < end + 0.02 and not stream.stopped.is_set()
+    with pytest.raises(NotSafe, match="joint range"):
+        stream.play(stream.hold()[None] + [0, 0, 0, 0, 0, 0, 0.03])  # the gate cannot be gone around
+
+
+def test_a_second_client_is_told_so(robot: FrankaBackend, stand_in: StandIn, robot_config: dict) -> None:
+    second = Arm(stand_in.ip, **{**robot_config["arm"], "timeout": 1})
+    with pytest.raises(BackendError, match="Another client may hold it"):
+        second.connect()
+
+
+def test_nobody_at_the_address(robot_config: dict) -> None:
+    pytest.importorskip("franky", reason="needs pip install mpc_sgft[franka]")
+    began = time.monotonic()
+    with pytest.raises(BackendError, match="no robot answers at 127.77.77.77"):
+        Arm("127.77.77.77", **robot_config["arm"]).connect()
+    assert time.monotonic() - began < 5

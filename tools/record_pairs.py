@@ -1,0 +1,76 @@
+"""Pictures of a tag on the robot's hand, and the hand's poses: what `calibrate_camera solve` reads."""
+
+import json
+import time
+from dataclasses import asdict
+from importlib import import_module
+from pathlib import Path
+
+import numpy as np
+
+from envs.perception.base import PerceptionError
+from envs.perception.camera import Frame, RealSense
+from envs.perception.extra import load
+from mpc_sgft.errors import UserError
+from mpc_sgft.whole_file import write_whole
+
+AT_REST = 0.01  # [rad/s] of the fastest joint
+WAIT_S = 2.0  # [s] for a picture that was taken after the key was pressed
+ASK = "pair {}: guide the hand, let go, press Enter (q and Enter: finish) "
+
+
+def record(robot_ip: str, serial: str, folder: Path, recording: Path | None = None) -> None:
+    """Ask for places until the user has finished; pairs.json is complete after each.
+
+    Raises:
+        UserError: If the robot does not answer, the folder holds something, or franky is not installed.
+        PerceptionError: If the camera cannot be used.
+    """
+    if folder.exists() and any(folder.iterdir()):
+        raise UserError(f"{folder} is not empty; give a new folder with --out.")
+    try:
+        franky = import_module("franky")
+    except ModuleNotFoundError:
+        raise UserError("recording needs the robot's client: pip install 'mpc_sgft[franka]'.") from None
+    camera = RealSense(serial, depth=False, recording=recording)
+    try:
+        try:
+            robot = franky.Robot(robot_ip, realtime_config=franky.RealtimeConfig.Ignore)
+        except franky.Exception as err:
+            raise UserError(
+                f"the robot at {robot_ip} does not answer: {str(err).rstrip('.')}. Is it on, unlocked, and FCI active?"
+            ) from err
+        pairs: list[dict] = []
+        while input(ASK.format(len(pairs))).strip().lower() != "q":
+            state = robot.state
+            if np.abs(state.dq).max() > AT_REST:
+                print("the robot moves; wait until it rests")
+                continue
+            name = f"{len(pairs):02d}.png"
+            _save(folder / name, _fresh(camera))
+            pairs.append({"base_T_hand": np.asarray(state.O_T_EE.matrix).tolist(), "image": name})
+            whole = {"serial": camera.serial, "intrinsics": asdict(camera.intrinsics), "pairs": pairs}
+            write_whole(folder / "pairs.json", json.dumps(whole, indent=1).encode())
+        print(f"{len(pairs)} pairs in {folder}")
+    except EOFError:
+        print()
+    finally:
+        camera.close()
+
+
+def _fresh(camera: RealSense) -> Frame:
+    """A picture that was taken after this was called."""
+    called = time.monotonic()
+    while time.monotonic() < called + WAIT_S:
+        frame = camera.read()
+        if frame is not None and frame.time > called:
+            return frame
+        time.sleep(0.01)
+    raise PerceptionError(f"camera {camera.serial} sent no picture for {WAIT_S:.0f} s.")
+
+
+def _save(path: Path, frame: Frame) -> None:
+    cv2 = load("cv2")
+    done, data = cv2.imencode(".png", cv2.cvtColor(frame.color, cv2.COLOR_RGB2BGR))
+    assert done, path
+    write_whole(path, data.tobytes())
