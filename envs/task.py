@@ -83,6 +83,14 @@ class AbstractTask(ABC):
     def scripted(self, observation: Array) -> Array:
         """A hand-written policy [N, A]: proof that the task can be solved."""
 
+    def hold(self, qpos: Array) -> Array:
+        """The controller's command that keeps the machine where it stands, [N, C], for its own joints [N, nu]."""
+        return qpos.copy()
+
+    def place(self, observation: Array, qpos: Array) -> Array:
+        """Joint positions [N, nq] with the objects where an observation [N, O] sees them; other joints stay."""
+        return qpos.copy()
+
     def terminated(self, observation: Array) -> NDArray[np.bool_]:
         """Whether the task itself ends here, [N]; by default it never does, only the clock runs out."""
         return np.zeros(len(observation), bool)

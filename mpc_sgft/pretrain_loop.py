@@ -10,6 +10,7 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig
 from torch import Tensor
 
+from envs.env import ControlEnv
 from mpc_sgft import build, checkpoint, run_folder
 from mpc_sgft.agent import Agent
 from mpc_sgft.errors import Stopped, UserError
@@ -26,7 +27,7 @@ def pretrain(cfg: DictConfig) -> int:
     build.prepare_process(cfg)
     env = build.make_env(cfg, cfg.num_envs, randomised=True)
     judge = build.make_env(cfg, cfg.eval_episodes, randomised=True)
-    agent = build.make_agent(cfg, env)
+    agent = start_agent(cfg, env)
     buffer = instantiate(cfg.train.replay, seed=cfg.seed)
     state = {"round": 0, "updates": 0, "transitions": 0, "episodes": 0, "seconds": 0.0, "streak": 0}
     saved = folder / "checkpoint" / "state.pt"
@@ -110,6 +111,25 @@ def pretrain(cfg: DictConfig) -> int:
     logger.close()
     print(json.dumps(summary))
     return 0
+
+
+def start_agent(cfg: DictConfig, env: ControlEnv) -> Agent:
+    """A fresh agent, or that of `checkpoint=` to go on from with new data.
+
+    Raises:
+        UserError: If the checkpoint does not fit, or was changed by a deployment.
+    """
+    if cfg.checkpoint is None:
+        return build.make_agent(cfg, env)
+    agent, meta = build.load_agent(cfg)
+    build.check_fits(agent.model, env)
+    changed = [part for part in ("command_map", "residual") if meta.get(part)]
+    if changed:
+        raise UserError(
+            f"checkpoint={cfg.checkpoint} comes from a deployment (it has a {changed[0]}): pretraining goes on from "
+            "pretrained checkpoints. Give the one that the deployment started from."
+        )
+    return agent
 
 
 def explorer(agent: Agent, cfg: DictConfig, round_number: int) -> Act:

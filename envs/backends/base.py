@@ -57,7 +57,8 @@ class Backend(Protocol):
 
     def samples(self) -> dict[str, Array] | None:
         """Joint-level record of the first environment's last period at 100 Hz or more: time [S] since the episode's
-        start, qpos [S, nq], qvel [S, nv], ctrl [S, nu], force [S, nu]; None if there is none."""
+        start, qpos [S, nq], qvel [S, nv], ctrl [S, nu] as the interface meant it, force [S, nu] of the actuators; None
+        if there is none."""
         ...
 
     def describe(self) -> dict[str, object]:

@@ -69,6 +69,7 @@ class SimBackend:
         self.clock, self.delayed = self.batch.bind("time"), self.batch.bind("history")
         self.applied = self.batch.bind("qfrc_applied")[:, : nominal.nv]
         self.told = np.zeros((num_envs, nominal.nu))  # control signals before the effects that change them
+        self.hides_commands = any(type(e).command is not Effect.command for e in self.effects)
         self.randomizer = Randomizer(self.batch, self.model, draws or [])
         self.noise_sd, self.noise_probability = noise_sd, noise_probability
         self.steps = whole_steps(task.control_dt, task.sim_dt)
@@ -80,6 +81,7 @@ class SimBackend:
         self.slots = [_history_values(self.model, i) for i in range(self.model.nu)]
         self.record = ("qpos", "qvel", "actuator_force")
         self.target = np.zeros((num_envs, task.start(np.random.default_rng(0)).target.shape[1]))
+        self.meant = self.target[:1], self.told[:1]  # command and signal of the first one if no effect changed them
         self.noisy, self.unstable = np.zeros(num_envs, bool), np.zeros(num_envs, bool)
         self.remembers = any(type(e).sense is not Effect.sense for e in self.effects)
         self.past: list[tuple[Array, Array]] = []
@@ -111,6 +113,8 @@ class SimBackend:
         self.state[0][sims], self.state[1][sims] = whole
         self.told[sims] = told = self.task.ctrl(self.target[sims], self.qpos[sims, : self.model.nu])
         self.signal[sims] = ctrl = self._change(told)
+        if 0 in sims:
+            self.meant = self.target[:1].copy(), self.told[:1].copy()
         self.unstable[sims] = False
         if self.model.na:
             self.act[sims] = ctrl
@@ -137,7 +141,8 @@ class SimBackend:
         start = float(self.clock[0])
         moved = self._advance(self._change(ctrl.reshape(-1, ctrl.shape[2])).reshape(ctrl.shape))
         time = start + np.linspace(self.task.sim_dt, self.task.control_dt, self.steps)
-        self._last = {"time": time, "ctrl": ctrl, **moved}
+        streamed = self._streamed(sent[:1], ramp) if self.hides_commands else ctrl[:1]
+        self._last = {"time": time, "ctrl": streamed, **moved}
         if self.remembers:
             self.past.insert(0, (moved["qpos"].copy(), moved["qvel"].copy()))
             del self.past[int(MAX_PAST / self.task.control_dt) + 1 :]
@@ -156,7 +161,7 @@ class SimBackend:
         return self.state[0][0].copy()
 
     def samples(self) -> dict[str, Array]:
-        """As `Backend.samples`, thinned to 125 Hz at 4 ms."""
+        """As `Backend.samples`, thinned to 125 Hz at 4 ms; `ctrl` is what the interface meant, before any effect."""
         every = max(1, int(MAX_SAMPLE_DT / self.task.sim_dt))
         pick = slice(every - 1, None, every)
         last = self._last
@@ -168,6 +173,17 @@ class SimBackend:
 
     def close(self) -> None:
         """Nothing moves by itself here."""
+
+    def _streamed(self, sent: Array, ramp: Array) -> Array:
+        """Control signals of the first environment as the interface means them, [1, S, nu].
+
+        The recording must not show what a hidden effect made of the command.
+        """
+        target, before = self.meant
+        target = self.task.move(target, sent)
+        after = self.task.ctrl(target, before)
+        self.meant = target, after
+        return before[:, None] + ramp * (after - before)[:, None]
 
     def _change(self, told: Array) -> Array:
         """What effects at named actuators make of control signals [T, nu]; the others act on the action."""

@@ -67,6 +67,9 @@ class Pendulum(AbstractTask):
     def ctrl(self, target: Array, previous_ctrl: Array) -> Array:
         return target
 
+    def hold(self, qpos: Array) -> Array:
+        return np.zeros_like(qpos)  # a torque: none
+
     def observe(self, qpos: Array, qvel: Array) -> Array:
         return np.concatenate([np.cos(qpos), np.sin(qpos), qvel], 1)
 

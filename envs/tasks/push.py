@@ -160,6 +160,18 @@ class Push(AbstractTask):
             return target
         return kinematics.inverse(previous_ctrl, self._tip_target(target), REST, TOOL_LENGTH)
 
+    def hold(self, qpos: Array) -> Array:
+        if self.control == "joint":
+            return qpos.copy()
+        return kinematics.tip_position(qpos[:, :7], TOOL_LENGTH)[:, :2] - ORIGIN[:2]
+
+    def place(self, observation: Array, qpos: Array) -> Array:
+        """The puck lies flat where it is seen; its turn about the vertical is not observed and left at zero."""
+        placed = qpos.copy()
+        placed[:, 7:14] = [0, 0, ORIGIN[2] + PUCK_HALF_HEIGHT, 1, 0, 0, 0]
+        placed[:, 7:9] = observation[:, 2:4] + ORIGIN[:2]
+        return placed
+
     def observe(self, qpos: Array, qvel: Array) -> Array:
         tip = kinematics.tip_position(qpos[:, :7], TOOL_LENGTH)
         return np.concatenate([tip[:, :2], qpos[:, 7:9]], 1) - np.tile(self.origin[:2], 2)

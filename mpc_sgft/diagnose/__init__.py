@@ -2,6 +2,7 @@
 
     from mpc_sgft.diagnose import diagnose
     report = diagnose("scene.xml", ["episodes/"], out=Path("out"))
+    report = diagnose_run(Path("runs/push/latest"))  # from mpc_sgft.diagnose.deployed: what deploy recorded
 
 `record -> replay -> locate -> fit -> name -> repair -> report`, one file each.
 """

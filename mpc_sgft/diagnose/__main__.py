@@ -1,4 +1,4 @@
-"""`python -m mpc_sgft.diagnose --model scene.xml --data EPISODES... --out OUT`"""
+"""`python -m mpc_sgft.diagnose --model scene.xml --data EPISODES... --out OUT`, or `--run RUN_FOLDER [--retrain]`"""
 
 from __future__ import annotations
 
@@ -15,11 +15,20 @@ def parser() -> argparse.ArgumentParser:
     )
     p.add_argument("--model", type=Path, metavar="XML", help="nominal MJCF scene")
     p.add_argument("--data", type=Path, nargs="+", metavar="PATH", help="episodes: CSV, Parquet or MCAP files, folders")
-    p.add_argument("--out", type=Path, metavar="DIR", help="where the report goes; default diagnosis/")
+    p.add_argument(
+        "--out", type=Path, metavar="DIR", help="where the report goes; default diagnosis/, or RUN/diagnosis"
+    )
     p.add_argument(
         "--run", type=Path, metavar="DIR", help="a run folder that deploy recorded, instead of --model --data"
     )
-    p.add_argument("--retrain", action="store_true", help="with --run: go on pretraining in the repaired simulator")
+    p.add_argument(
+        "--retrain",
+        action="store_true",
+        help="with --run: pretrain on in the repaired simulator, deploy again, compare",
+    )
+    p.add_argument(
+        "--retrain-transitions", type=int, default=60_000, metavar="N", help="how long; default 60000, a few minutes"
+    )
     p.add_argument("--effects", metavar="A,B", help="consider only these effects")
     p.add_argument("--signals", metavar="A,B", help="compare only these columns, such as qpos/elbow")
     p.add_argument("--window", type=float, metavar="S", help="length of a simulated window; default from the data")
@@ -31,7 +40,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Exit code 0 for every verdict, 2 for bad input, 130 for Ctrl-C."""
+    """Exit code 0 for every verdict, 2 for bad input, 3 if training met a number that is not finite, 130 for Ctrl-C."""
     args = parser().parse_args(argv)
     from mpc_sgft.errors import UserError, disk_error
 
@@ -46,8 +55,11 @@ def main(argv: list[str] | None = None) -> int:
             raise
         print(f"error: {message}", file=sys.stderr)
         return 2
-    except KeyboardInterrupt:
-        print("\nstopped by Ctrl-C", file=sys.stderr)
+    except FloatingPointError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 3
+    except KeyboardInterrupt as stop:
+        print(f"\n{str(stop) or 'stopped by Ctrl-C'}", file=sys.stderr)
         return 130
 
 
@@ -56,7 +68,7 @@ def _run(args: argparse.Namespace) -> int:
     from mpc_sgft.errors import UserError
 
     if args.run is not None:
-        raise UserError("--run cannot read deployments yet; give --model and --data.")
+        return _run_folder(args)
     if args.retrain:
         raise UserError("--retrain needs --run, the deployment to learn from.")
     missing = [name for name in ("model", "data") if getattr(args, name) is None]
@@ -78,6 +90,46 @@ def _run(args: argparse.Namespace) -> int:
     )
     print(report.summary())
     print(f"report: {out / 'report.html'}")
+    return 0
+
+
+def _run_folder(args: argparse.Namespace) -> int:
+    from mpc_sgft.diagnose.deployed import diagnose_run
+    from mpc_sgft.errors import UserError
+
+    for name in ("model", "data", "signals", "uncertain"):
+        if getattr(args, name) is not None:
+            raise UserError(f"--{name} does not go with --run, which brings its own scene and episodes; leave it out.")
+    if args.retrain_transitions < 1:
+        raise UserError(f"--retrain-transitions {args.retrain_transitions}: a whole number from 1 on.")
+    out = args.out or args.run / "diagnosis"
+    if args.retrain:
+        from mpc_sgft.diagnose.retrain import outcome, retrain, table
+
+        outcome(args.run)  # an unfinished run stops here, not after the diagnosis
+        taken = [str(out / part) for part in ("pretrain", "deploy") if (out / part).exists()]
+        if taken:
+            raise UserError(f"{taken[0]} is there from an earlier --retrain. Move it away, or give another --out.")
+    report = diagnose_run(
+        args.run,
+        out=out,
+        effects=_names(args.effects),
+        window=args.window,
+        held_out=_held_out(args.held_out),
+        seed=args.seed,
+        max_effects=args.max_effects,
+        progress=True,
+    )
+    print(report.summary())
+    print(f"report: {out / 'report.html'}")
+    if args.retrain:
+        import yaml
+
+        effects = yaml.safe_load((out / "effects.yaml").read_text())["effects"]
+        if not effects:
+            print("nothing to retrain on: no effect was found")
+            return 0
+        print(table(retrain(args.run, effects, out, args.retrain_transitions)))
     return 0
 
 

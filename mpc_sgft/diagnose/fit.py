@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -47,6 +47,16 @@ def change_of(terms: Sequence[Term], values: Sequence[Array]) -> Change:
     return total
 
 
+class Residuals(Protocol):
+    """What can be fitted. `blocks` is the number of independent points of a signal in a window."""
+
+    blocks: int
+
+    def residuals(self, terms: Sequence[Term], points: Sequence[Sequence[Array]], pick: Index) -> Array:
+        """Whitened residuals of one structure at K points on some windows, [K, W, m]."""
+        ...
+
+
 class Problem:
     """Residuals of structures over windows.
 
@@ -88,7 +98,7 @@ class Problem:
 
 
 def fit(
-    problem: Problem, terms: Sequence[Term], start: Sequence[Array], pick: Index, iterations: int = ITERATIONS
+    problem: Residuals, terms: Sequence[Term], start: Sequence[Array], pick: Index, iterations: int = ITERATIONS
 ) -> Fit:
     """Bounded Levenberg-Marquardt; each iteration tries three dampings in one batch.
 
@@ -127,7 +137,7 @@ def fit(
     return Fit(tuple(terms), tuple(flat.unpack(x)), r, J)
 
 
-def _linearise(problem: Problem, flat: _Flat, x: Array, pick: Index) -> tuple[Array, Array]:
+def _linearise(problem: Residuals, flat: _Flat, x: Array, pick: Index) -> tuple[Array, Array]:
     steps = flat.steps(x)
     points = [x, *(x + steps[i] * np.eye(flat.count)[i] for i in range(flat.count))]
     all_r = problem.residuals(flat.terms, [flat.unpack(p) for p in points], pick)
@@ -172,7 +182,7 @@ class _Flat:
         return np.where(x + STEP > self.high, -STEP, STEP)
 
 
-def window_errors(problem: Problem, f: Fit, pick: Index) -> Array:
+def window_errors(problem: Residuals, f: Fit, pick: Index) -> Array:
     """Mean whitened square of a fitted structure on windows that it may not have seen, [W]."""
     return (problem.residuals(f.terms, [f.values], pick)[0] ** 2).mean(1)
 

@@ -36,7 +36,7 @@ class Term:
         names, units: Of the parameters.
         neutral, low, high, size: Arrays [p]: without effect, bounds, typical size.
         starts: Where fits start, each [p].
-        build: values [p] -> what they change.
+        build: values [p] -> what they change: a Change, or a tuple of effects where a task's simulation applies them.
         fixed: Parameters that are set and not fitted.
     """
 
@@ -49,7 +49,7 @@ class Term:
     high: Array
     size: Array
     starts: tuple[Array, ...]
-    build: Callable[[Array], Change]
+    build: Callable[[Array], Any]
     fixed: Mapping[str, Any] = field(default_factory=dict)
 
     @property

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import stats
@@ -38,7 +38,7 @@ class Verdict(NamedTuple):
     reason: str
 
 
-def choose(setup: Setup, entries: list[Entry], rng: np.random.Generator) -> Entry:
+def choose(setup: Setup[Any], entries: list[Entry], rng: np.random.Generator) -> Entry:
     """The smallest set that no larger one credibly beats."""
     current = entries[0]
     while True:
@@ -50,7 +50,7 @@ def choose(setup: Setup, entries: list[Entry], rng: np.random.Generator) -> Entr
         current = min((e for e in better if e.complexity == smallest), key=lambda e: e.error)
 
 
-def prune(setup: Setup, best: Entry, entries: list[Entry], rng: np.random.Generator) -> Entry:
+def prune(setup: Setup[Any], best: Entry, entries: list[Entry], rng: np.random.Generator) -> Entry:
     """Leave out effects that are not needed once the others are there; fitted subsets join `entries`."""
     nominal = len(setup.baseline.terms)
     for i in range(nominal, len(best.fit.terms)):
@@ -68,7 +68,9 @@ def prune(setup: Setup, best: Entry, entries: list[Entry], rng: np.random.Genera
     return best
 
 
-def judge_entries(setup: Setup, entries: list[Entry], flexible: Flexible | None, rng: np.random.Generator) -> Verdict:
+def judge_entries(
+    setup: Setup[Any], entries: list[Entry], flexible: Flexible | None, rng: np.random.Generator
+) -> Verdict:
     """Compare everything that was fitted.
 
     Args:

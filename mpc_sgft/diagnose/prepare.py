@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Generic, TypeVar
 
 import mujoco
 import numpy as np
 
-from mpc_sgft.diagnose.fit import Fit, Problem, change_of, fit
+from mpc_sgft.diagnose.fit import Fit, Problem, Residuals, change_of, fit
 from mpc_sgft.diagnose.library import Term
 from mpc_sgft.diagnose.plant import Plant, joint_of
 from mpc_sgft.diagnose.record import Array, Episode, Index
@@ -23,8 +24,11 @@ BLOCKS = 8  # into which the fitted windows are split for leaving out
 KICK = 1e-4  # of the typical size, to differentiate by the start
 
 
+P = TypeVar("P", bound=Residuals)
+
+
 @dataclass(frozen=True)
-class Setup:
+class Setup(Generic[P]):
     """A problem with its baseline.
 
     Attributes:
@@ -33,15 +37,17 @@ class Setup:
         blocks: Contiguous block of each fitted window.
         baseline: The nominal model with uncertain quantities refitted.
         noise, floor: Of each signal, of the sensor and of the simulator, [S].
+        judged: What of a window's error counts when sets are compared; the error itself by default.
     """
 
-    problem: Problem
+    problem: P
     fitted: Index
     held: Index
     blocks: Index
     baseline: Fit
     noise: Array
     floor: Array
+    judged: Callable[[Array], Array] = field(default=np.asarray)
 
 
 def default_window(episodes: Sequence[Episode]) -> float:
@@ -64,7 +70,7 @@ def prepare(
     window: float | None,
     signals: Sequence[str] | None,
     held_out: float | Sequence[str] | None,
-) -> Setup:
+) -> Setup[Problem]:
     """Cut windows, measure noise and floor, and refit the nominal quantities."""
     chosen = list(signals or default_signals(episodes, plant))
     missing = [s for s in chosen if any(s not in e.signals for e in episodes)]
@@ -84,8 +90,12 @@ def prepare(
     return Setup(problem, fitted, held, blocks, base, noise, floor)
 
 
-def split(replayer: Replayer, held_out: float | Sequence[str] | None) -> tuple[Index, Index]:
+def split(replayer: Any, held_out: float | Sequence[str] | None) -> tuple[Index, Index]:
     """Windows to fit and windows to hold out: whole episodes, or the end of the only one.
+
+    Args:
+        replayer: Has `windows` with the episode of each, and `episodes` with names.
+        held_out: Share of the data, or names of episodes; a quarter if None.
 
     Raises:
         UserError: If a named episode does not exist or one side would be empty.

@@ -105,8 +105,8 @@ def assemble(
     data: dict[str, Any] = {
         "verdict": verdict.kind,
         "reason": verdict.reason,
-        "effects": _effects(best, entries, verdict) if shown else [],
-        "candidates": _candidates(entries, best, verdict, rng),
+        "effects": effect_rows(best, entries, verdict) if shown else [],
+        "candidates": candidate_rows(entries, best, verdict, rng),
         "ties": ties,
         "next_experiment": next_experiment(setup, tied) if len(tied) > 1 else "",
         "nominal_refit": refit_table(list(base.terms), list(best.fit.values[: len(base.terms)])),
@@ -125,14 +125,15 @@ def assemble(
     return Report(data, measured, nominal, repaired, replayer)
 
 
-def _effects(best: Entry, entries: list[Entry], verdict: Verdict) -> list[dict[str, Any]]:
+def effect_rows(best: Entry, entries: list[Entry], verdict: Verdict) -> list[dict[str, Any]]:
+    """What the report says of each named effect."""
     out = []
     bounds = intervals(best)
     shares = effect_probability(best, entries, verdict.probability)
     for term, value, (low, high), share in zip(best.terms, best.values, bounds, shares, strict=True):
         columns = [numbers(term.effect, term.names, x) for x in (value, low, high)]
         units = dict(zip(term.names, term.units, strict=True))
-        sums = TABLE[term.effect].sums
+        sums = TABLE[term.effect].sums if term.effect in TABLE else {}
         out.append(
             {
                 "name": term.effect,
@@ -152,7 +153,9 @@ def _effects(best: Entry, entries: list[Entry], verdict: Verdict) -> list[dict[s
     return out
 
 
-def _candidates(entries: list[Entry], best: Entry, verdict: Verdict, rng: np.random.Generator) -> list[dict[str, Any]]:
+def candidate_rows(
+    entries: list[Entry], best: Entry, verdict: Verdict, rng: np.random.Generator
+) -> list[dict[str, Any]]:
     """Ranked: what is named, what ties, then the rest by error and size."""
     front = [best.key, *(e.key for e, _ in verdict.ties)]
     size = len(best.errors)
@@ -184,10 +187,6 @@ def _held_out(
     before, after = (((p - measured)[held] ** 2).mean(1) for p in (nominal, repaired))  # [W, S]
     i = int(np.argmax(before.mean(0) / problem.scale**2))
     name = problem.replayer.signals[i]
-    picks = rng.integers(0, len(held), (judge.RESAMPLES, len(held)))
-    drops = 1 - np.sqrt(after[picks, i].mean(1) / np.maximum(before[picks, i].mean(1), 1e-300))
-    low, high = np.quantile(drops, [0.05, 0.95])
-    rms = [float(np.sqrt(x[:, i].mean())) for x in (before, after)]
     plant = problem.replayer.plant
     kind, part = name.split("/", 1)
     unit = "1"
@@ -196,8 +195,23 @@ def _held_out(
         unit = ("m" if slide else "rad") + ("/s" if kind == "qvel" else "")
     elif kind == "force":
         unit = "N or N m"
+    return reduction(name, unit, before[:, i], after[:, i], rng)
+
+
+def reduction(signal: str, unit: str, before: Array, after: Array, rng: np.random.Generator) -> dict[str, Any]:
+    """Root mean square error of one signal before and after, and by how much it fell, with its 90 % interval.
+
+    Args:
+        signal, unit: Of the signal.
+        before, after: Mean square error of each held-out window, [W].
+        rng: For the bootstrap.
+    """
+    picks = rng.integers(0, len(before), (judge.RESAMPLES, len(before)))
+    drops = 1 - np.sqrt(after[picks].mean(1) / np.maximum(before[picks].mean(1), 1e-300))
+    low, high = np.quantile(drops, [0.05, 0.95])
+    rms = [float(np.sqrt(x.mean())) for x in (before, after)]
     return {
-        "signal": name,
+        "signal": signal,
         "unit": unit,
         "nominal": rms[0],
         "repaired": rms[1],

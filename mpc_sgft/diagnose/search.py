@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -13,11 +13,24 @@ from mpc_sgft.diagnose.library import Term, enrich, includes
 from mpc_sgft.diagnose.prepare import Setup
 from mpc_sgft.diagnose.record import Array, Index
 
-BEAM = 3  # sets that are extended
-FULL = (8, 5, 4)  # candidates that get a full fit: alone, as a second effect, as a third
-SCREEN = 24  # windows to screen on
 INVISIBLE = 1e-4  # times the noise: an effect of typical size that changes less is no candidate
 SEEN = 1e-3  # a parameter whose derivative is smaller than this share of the largest changes nothing
+
+
+class Effort(NamedTuple):
+    """How widely to search.
+
+    Attributes:
+        beam: Sets that are extended.
+        full: Candidates that get a full fit: alone, as a second effect, as a third.
+        screen: Windows to screen on.
+        enough: Pairs are tried although no effect alone gains, if the error is above this; never by default.
+    """
+
+    beam: int = 3
+    full: tuple[int, ...] = (8, 5, 4)
+    screen: int = 24
+    enough: float = np.inf
 
 
 class Entry(NamedTuple):
@@ -62,10 +75,11 @@ class Proposal(NamedTuple):
     cost: float
 
 
-def entry(setup: Setup, f: Fit) -> Entry:
+def entry(setup: Setup[Any], f: Fit) -> Entry:
     """Judge a fit on all windows: fitted ones by leaving out their block, the others as they are."""
     nominal = len(setup.baseline.terms)
     errors = np.concatenate([left_out_errors(f, setup.blocks), window_errors(setup.problem, f, setup.held)])
+    errors = setup.judged(errors)
     norms = np.sqrt((f.J**2).sum((0, 1)))
     own = norms[sum(len(t.size) for t in f.terms[:nominal]) :]
     seen = int((own > SEEN * max(float(own.max()), 1e-12)).sum()) if len(own) else 0
@@ -73,11 +87,12 @@ def entry(setup: Setup, f: Fit) -> Entry:
 
 
 def search(
-    setup: Setup,
+    setup: Setup[Any],
     terms: Sequence[Term],
     max_effects: int,
     rng: np.random.Generator,
     report: Callable[[str, float], None] = lambda what, done: None,
+    effort: Effort = Effort(),  # noqa: B008, it is a tuple
 ) -> list[Entry]:
     """All sets that were fitted, baseline first.
 
@@ -87,6 +102,7 @@ def search(
         max_effects: Largest set.
         rng: For the bootstrap that decides whether to go on.
         report: Told what is being done, and the share that is done.
+        effort: How widely.
     """
     found = {frozenset(): entry(setup, setup.baseline)}
     beam, best = list(found.values()), found[frozenset()]
@@ -94,8 +110,8 @@ def search(
         new: dict[frozenset[str], Entry] = {}
         for b, parent in enumerate(beam):
             report(f"{' + '.join(parent.names) or 'nominal'}", (level + b / len(beam)) / (max_effects + 1))
-            ranked = screen(setup, parent, proposals(parent, terms, max_effects))
-            for proposal in ranked[: FULL[min(level, len(FULL) - 1)]]:
+            ranked = screen(setup, parent, proposals(parent, terms, max_effects), effort.screen)
+            for proposal in ranked[: effort.full[min(level, len(effort.full) - 1)]]:
                 key = frozenset(t.label + str(t.fixed) for t in proposal.terms[len(setup.baseline.terms) :])
                 if key in found or key in new:
                     continue
@@ -104,10 +120,11 @@ def search(
         found |= new
         if not new:
             break
-        beam = sorted(new.values(), key=lambda e: e.error)[:BEAM]
-        if not judge.credible(best.errors, beam[0].errors, rng):
+        beam = sorted(new.values(), key=lambda e: e.error)[: effort.beam]
+        if judge.credible(best.errors, beam[0].errors, rng):
+            best = beam[0]
+        elif level or best.error <= effort.enough:
             break
-        best = beam[0]
     return list(found.values())
 
 
@@ -132,9 +149,11 @@ def proposals(
     return out
 
 
-def screen(setup: Setup, parent: Entry, options: list[tuple[tuple[Term, ...], list[Array], int]]) -> list[Proposal]:
+def screen(
+    setup: Setup[Any], parent: Entry, options: list[tuple[tuple[Term, ...], list[Array], int]], windows: int
+) -> list[Proposal]:
     """Order proposals by their error after one Gauss-Newton step, the best start of each set only."""
-    problem, pick = setup.problem, _spread(setup.fitted, SCREEN)
+    problem, pick = setup.problem, _spread(setup.fitted, windows)
     rows = np.searchsorted(setup.fitted, pick)
     best: dict[frozenset[str], Proposal] = {}
     for terms, start, new in options:

@@ -1,9 +1,12 @@
-"""How pretraining explores."""
+"""How pretraining explores, and what it may start from."""
 
+import pytest
 import torch
 from omegaconf import OmegaConf
 
-from mpc_sgft.pretrain_loop import explorer
+from mpc_sgft import build, checkpoint, compose
+from mpc_sgft.errors import UserError
+from mpc_sgft.pretrain_loop import explorer, start_agent
 from mpc_sgft.world_model import WorldModel
 
 SIZES = dict(obs_dim=6, action_dim=2, decode_dim=3, latent_dim=16, mlp_dim=32, enc_dim=32, num_q=2)
@@ -28,3 +31,42 @@ def test_detours_hold_one_action_in_their_share_of_the_copies():
     assert actions.abs().max() <= 1
     again = explorer(OnlyAModel(), cfg, 0)
     assert torch.equal(again(observation, torch.ones(200, dtype=torch.bool)), actions[0])
+
+
+def config(**changed):
+    cfg = compose.compose("pretrain", ["task=push", "+experiment=debug"], [])
+    OmegaConf.set_struct(cfg, False)
+    return OmegaConf.merge(cfg, changed)
+
+
+def test_pretraining_goes_on_from_a_checkpoint(tmp_path):
+    cfg = config(device="cpu")
+    env = build.make_env(cfg, 1)
+    first = build.make_agent(cfg, env)
+    meta = checkpoint.describe(cfg, first.model)
+    checkpoint.save(tmp_path / "a.safetensors", first.model, meta)
+    again = start_agent(config(checkpoint=str(tmp_path / "a.safetensors"), seed=7), env)
+    for name, x in first.model.state_dict().items():
+        assert torch.equal(x, again.model.state_dict()[name]), name
+    fresh = start_agent(config(seed=7), env).model.state_dict()
+    assert any(not torch.equal(x, fresh[name]) for name, x in first.model.state_dict().items())
+
+
+def test_a_deployment_s_checkpoint_is_no_start_for_pretraining(tmp_path):
+    cfg = config()
+    env = build.make_env(cfg, 1)
+    agent = build.make_agent(cfg, env)
+    agent.model.add_command_map()
+    checkpoint.save(tmp_path / "a.safetensors", agent.model, checkpoint.describe(cfg, agent.model))
+    with pytest.raises(UserError, match="comes from a deployment .it has a command_map"):
+        start_agent(config(checkpoint=str(tmp_path / "a.safetensors")), env)
+
+
+def test_found_effects_and_draws_combine():
+    found = {"actuator_delay": {"delay": 0.3}, "payload": {"mass": 0.5, "at": ["puck"]}}
+    env = build.make_env(config(gap={"effects": found}), 8, randomised=True)
+    env.set_seed(0)
+    env.reset()
+    latency = env.backend.batch.expand("actuator_delay")[:, 0]
+    assert (latency >= 0.3).all() and (latency <= 0.45).all() and len(set(latency)) == 8
+    assert env.backend.model.body("payload_puck").mass[0] == 0.5

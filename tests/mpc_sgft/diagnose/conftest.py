@@ -1,4 +1,4 @@
-"""A slide and a pendulum with known truth, simulated here with an integrator of the tests' own."""
+"""A slide with known truth, simulated here with an integrator of the tests' own; and recorded deployments."""
 
 from __future__ import annotations
 
@@ -7,8 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
+from envs.backends.sim import SimBackend
+from envs.effects import load
+from envs.tasks.push import Push
 from mpc_sgft.diagnose.record import write_csv
+from mpc_sgft.record import EpisodeWriter
 
 SLIDE = """<mujoco><option timestep="0.002"/><worldbody><body name="cart">
 <joint name="x" type="slide" axis="1 0 0"/><geom size="0.1" mass="5"/></body></worldbody>
@@ -68,3 +73,93 @@ def record(tmp_path: Path) -> Callable[..., Path]:
         return path
 
     return write
+
+
+PUSH = Path(__file__).parents[3] / "configs" / "task" / "push.yaml"
+REPORT = {  # key of report.json -> type, or {key: type} of each item
+    "verdict": str,
+    "reason": str,
+    "effects": {"name": str, "at": list, "parameters": dict, "probability": float},
+    "candidates": {"effects": list, "held_out_error": float, "low": float, "high": float, "probability": float},
+    "ties": {"effects": list, "probability": float, "held_out_error": float, "reason": str},
+    "next_experiment": str,
+    "nominal_refit": dict,
+    "where": {"signal": str, "regime": str, "share_of_error": float, "share_of_time": float},
+    "held_out": dict,
+    "noise_floor": dict,
+    "residual_model_error": (float, type(None)),
+    "seconds": float,
+    "repaired_model": str,
+    "effects_file": str,
+    "notes": list,
+}
+HELD_OUT = {
+    "signal": str,
+    "unit": str,
+    "nominal": float,
+    "repaired": float,
+    "reduction": float,
+    "low": float,
+    "high": float,
+}
+
+
+@pytest.fixture
+def check_report() -> Callable[[dict], None]:
+    """Every key of report.json is there, no other, and each holds what the README says."""
+
+    def check(report: dict) -> None:
+        assert set(report) == set(REPORT)
+        for key, kind in REPORT.items():
+            if isinstance(kind, dict):
+                for item in report[key]:
+                    assert set(item) == set(kind), key
+                    assert all(isinstance(item[k], t) for k, t in kind.items()), (key, item)
+            else:
+                assert isinstance(report[key], kind), (key, report[key])
+        assert report["verdict"] in ("effect", "none", "unknown", "not_identifiable")
+        assert set(report["held_out"]) == set(HELD_OUT)
+        assert all(isinstance(report["held_out"][k], t) for k, t in HELD_OUT.items())
+        for effect in report["effects"]:
+            for parameter in effect["parameters"].values():
+                assert set(parameter) == {"value", "unit", "low", "high"}
+                assert parameter["low"] <= parameter["value"] <= parameter["high"]
+        for floor in report["noise_floor"].values():
+            assert set(floor) == {"noise", "simulator"}
+
+    return check
+
+
+@pytest.fixture
+def deployed(tmp_path: Path) -> Callable[..., Path]:
+    """Drive push with its scripted policy in a gap and record it as deploy does; returns the run folder.
+
+    Its config.yaml tells a gap that was never there: who reads it is found out.
+    """
+
+    def make(effects: dict, episodes: int = 4, steps: int = 40) -> Path:
+        folder = tmp_path / "run"
+        (folder / "episodes").mkdir(parents=True)
+        task_cfg = yaml.safe_load(PUSH.read_text())
+        config = {"command": "deploy", "chosen": {"task": "push", "gap": "lie"}, "task": task_cfg}
+        config["gap"] = {"effects": {"actuator_gain": {"gain": 0.1}}}
+        (folder / "config.yaml").write_text(yaml.safe_dump(config))
+        task = Push(**{k: v for k, v in task_cfg["env"].items() if k != "_target_"})
+        backend, rng = SimBackend(task, 1, effects=load(effects)), np.random.default_rng(0)
+        for number in range(1, episodes + 1):
+            backend.seed(number)
+            seen = backend.reset(np.arange(1))
+            meta = {"task": "push", **backend.describe()}
+            with EpisodeWriter(folder / "episodes" / f"{number:04d}.mcap", meta) as writer:
+                for t in range(steps):
+                    action = np.clip(task.scripted(seen) + 0.3 * rng.standard_normal((1, 2)), -1, 1)
+                    out = backend.send(action)
+                    row = {"step": t, "time": (t + 1) * task.control_dt, "observation": seen[0], "action": action[0]}
+                    row |= {"next_observation": out.observation[0], "action_sent": out.action_sent[0]}
+                    row |= {"reward": 0.0, "terminated": False, "truncated": t == steps - 1, "success": False}
+                    writer.step(row | {"invalid": False}, backend.samples())
+                    seen = out.observation
+                writer.close({"success": False})
+        return folder
+
+    return make

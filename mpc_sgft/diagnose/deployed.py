@@ -1,0 +1,213 @@
+"""The whole way from a deployment's run folder to a report."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import mujoco
+import numpy as np
+import yaml
+from tqdm import tqdm
+
+from envs.effects.base import Effect
+from mpc_sgft.diagnose.chain import Chain, Prediction, effects_of
+from mpc_sgft.diagnose.deployment import Deployment, read_deployment
+from mpc_sgft.diagnose.fit import fit
+from mpc_sgft.diagnose.motion import SUB
+from mpc_sgft.diagnose.name import Verdict, judge_entries
+from mpc_sgft.diagnose.outlook import next_experiment
+from mpc_sgft.diagnose.prepare import BLOCKS, Setup, split
+from mpc_sgft.diagnose.record import Array
+from mpc_sgft.diagnose.report import Report
+from mpc_sgft.diagnose.run import candidate_rows, effect_rows, reduction
+from mpc_sgft.diagnose.search import Effort, Entry, search
+from mpc_sgft.diagnose.suspects import gap_of, suspects
+from mpc_sgft.errors import UserError
+
+LENGTH = 6  # control steps in a window
+MOST = 64  # windows
+EFFORT = Effort(beam=2, full=(5, 4, 3), screen=16, enough=1.0)
+
+
+def diagnose_run(
+    run: Path,
+    *,
+    out: Path | None = None,
+    effects: Sequence[str] | None = None,
+    window: float | None = None,
+    held_out: float | Sequence[str] | None = None,
+    seed: int = 0,
+    max_effects: int = 3,
+    progress: bool = False,
+) -> Report:
+    """Say what the task's simulation lacks, from what a deployment recorded; its gap is not read.
+
+    Args:
+        run: Run folder of `deploy`.
+        out: Folder for the report's files; nothing is written if None.
+        effects: Names of the only effects to consider; all that can act on the task if None.
+        window: Length of a simulated window [s]; six control steps if None.
+        held_out: Share of the episodes that is never fitted, or their names; a quarter if None.
+        seed: Of the bootstrap.
+        max_effects: Largest set of effects.
+        progress: Show a progress bar on stderr.
+
+    Raises:
+        UserError: For a folder that cannot be used.
+    """
+    if max_effects < 1:
+        raise UserError(f"max_effects={max_effects}: at least one effect must be allowed.")
+    if window is not None and not 0 < window < np.inf:
+        raise UserError(f"--window {window}: a length in seconds above 0.")
+    began, rng = time.perf_counter(), np.random.default_rng(seed)
+    deployment = read_deployment(run)
+    setup = prepare(deployment, window, held_out)
+    terms = [s.term() for s in suspects(deployment.task, effects)]
+    with tqdm(total=100, desc="diagnose", disable=not progress, bar_format="{desc} {bar} {n:.0f}% {postfix}") as bar:
+
+        def show(what: str, share: float) -> None:
+            bar.set_postfix_str(what)
+            bar.update(95 * share - bar.n)
+
+        entries = search(setup, terms, max_effects, rng, show, EFFORT)
+        verdict = judge_entries(setup, entries, None, rng)
+        bar.update(100 - bar.n)
+    notes = list(deployment.notes)
+    if len(deployment.episodes) == 1:
+        notes.append("one episode only: its end is held out, so that both sides come from the same run")
+    if out is not None:
+        out.mkdir(parents=True, exist_ok=True)
+        notes += write(deployment, verdict.best, out)
+    report = assemble(setup, entries, verdict, notes, rng)
+    report.data["seconds"] = round(time.perf_counter() - began, 2)
+    if out is not None:
+        report.write(out)
+    return report
+
+
+def prepare(deployment: Deployment, window: float | None, held_out: float | Sequence[str] | None) -> Setup[Chain]:
+    """Cut windows, measure noise and floor, and split episodes.
+
+    Sets are compared by the logarithm of windows' errors: objects are hit in few windows, and those differ by orders of
+    magnitude in how much they tell.
+    """
+    dt = deployment.task.control_dt
+    length = LENGTH if window is None else max(1, round(window / dt))
+    chain = Chain(deployment, length, MOST)
+    fitted, held = split(replayer_view(chain), held_out)
+    blocks = np.minimum(np.arange(len(fitted)) * BLOCKS // len(fitted), BLOCKS - 1)
+    floor = np.concatenate(
+        [chain.observation_floor, np.full(chain.drive.shape[2], chain.drive_scale), chain.joint_floor]
+    )
+    noise = np.concatenate([chain.noise, np.zeros(len(floor) - len(chain.noise))])
+    return Setup(chain, fitted, held, blocks, fit(chain, [], [], fitted), noise, floor, np.log1p)
+
+
+def assemble(
+    setup: Setup[Chain], entries: list[Entry], verdict: Verdict, notes: list[str], rng: np.random.Generator
+) -> Report:
+    """Everything that the report says; keys as for `--model --data`."""
+    chain, best = setup.problem, verdict.best
+    everything = np.arange(len(chain.windows.start))
+    sets = [(), effects_of(best.terms, best.values)]
+    both = chain.predict(sets, everything)
+    shown = verdict.kind in ("effect", "not_identifiable")
+    tied = [best, *(e for e, _ in verdict.ties)]
+    names = [n for group in chain.groups.values() for n in group]
+    data: dict[str, Any] = {
+        "verdict": verdict.kind,
+        "reason": verdict.reason,
+        "effects": effect_rows(best, entries, verdict) if shown else [],
+        "candidates": candidate_rows(entries, best, verdict, rng),
+        "ties": [
+            {"effects": e.names, "probability": verdict.probability[e.key], "held_out_error": e.error, "reason": reason}
+            for e, reason in verdict.ties
+        ],
+        "next_experiment": next_experiment(chain, tied) if len(tied) > 1 else "",
+        "nominal_refit": {},
+        "where": where(chain, both),
+        "held_out": held_out_row(chain, both, setup, rng),
+        "noise_floor": {
+            n: {"noise": float(a), "simulator": float(b)}
+            for n, a, b in zip(names, setup.noise, setup.floor, strict=True)
+        },
+        "residual_model_error": None,
+        "seconds": 0.0,
+        "repaired_model": "repaired.xml",
+        "effects_file": "effects.yaml",
+        "notes": notes,
+    }
+    measured = np.concatenate([chain.observed, chain.drive[:, SUB - 1 :: SUB]], 2)
+    nominal, repaired = (np.concatenate([both.observation[k], both.drive[k][:, SUB - 1 :: SUB]], 2) for k in (0, 1))
+    return Report(data, measured, nominal, repaired, replayer_view(chain))
+
+
+def errors_of(chain: Chain, y: Prediction) -> Array:
+    """Mean square error of every signal in every window, [K, W, S], in the signals' own units."""
+    observation = ((y.observation - chain.observed) ** 2).mean(2)
+    return np.concatenate([observation, ((y.drive - chain.drive) ** 2).mean(2), (y.joints**2).mean(2)], 2)
+
+
+def where(chain: Chain, both: Prediction) -> list[dict[str, Any]]:
+    """Shares of the nominal error by signal, and by whether an object moved in the window, largest first."""
+    everything = np.arange(len(chain.windows.start))
+    parts = [p[0] for p in chain.whitened(Prediction(*(x[:1] for x in both)), everything)]
+    rows, total = [], sum(float((p**2).mean()) for p in parts)
+    for part, names in zip(parts, chain.groups.values(), strict=True):
+        square = (part.reshape(len(part), -1, len(names)) ** 2).mean(1) / len(names)  # [W, S]
+        for regime, mask in (
+            ("all", np.ones(len(part), bool)),
+            ("object moves", chain.moving),
+            ("object rests", ~chain.moving),
+        ):
+            share = square[mask].sum(0) / len(part) / max(total, 1e-30)
+            rows += [
+                {"signal": n, "regime": regime, "share_of_error": float(s), "share_of_time": float(mask.mean())}
+                for n, s in zip(names, share, strict=True)
+            ]
+    return sorted(rows, key=lambda row: -row["share_of_error"])
+
+
+def held_out_row(chain: Chain, both: Prediction, setup: Setup[Chain], rng: np.random.Generator) -> dict[str, Any]:
+    """The signal that is worst in units of its scale, on windows that were never fitted."""
+    nominal, repaired = errors_of(chain, both)[:, setup.held]
+    names = [n for group in chain.groups.values() for n in group]
+    seen, joints = ((s**2).mean((0, 1)) for s in (chain.observation_scale, chain.joint_scale))
+    scale = np.concatenate([seen, np.full(len(chain.groups["drive"]), chain.drive_scale**2), joints])
+    i = int(np.argmax(nominal.mean(0) / scale))
+    unit = {"observation": "of the observation", "drive": "of the control", "qpos": "rad"}[names[i].split("/")[0]]
+    return reduction(names[i], unit, nominal[:, i], repaired[:, i], rng)
+
+
+def write(deployment: Deployment, best: Entry, out: Path) -> list[str]:
+    """Write effects.yaml and repaired.xml, the task's scene with the effects that MJCF carries; returns notes."""
+    mapping, notes = gap_of(deployment.task, best.terms, best.values)
+    text = yaml.safe_dump({"effects": mapping}, sort_keys=False)
+    (out / "effects.yaml").write_text("# Written by mpc_sgft.diagnose.\n" + text)
+    spec = deployment.task.spec()
+    for term, value in zip(best.terms, best.values, strict=True):
+        for effect in term.build(value):
+            effect.edit_spec(spec)
+            if type(effect).command is not Effect.command or not type(effect).native:
+                notes.append(
+                    f"{term.label}: it acts on commands or observations, MJCF cannot carry it; use effects.yaml"
+                )
+    path = out / "repaired.xml"
+    spec.compile()
+    path.write_text(spec.to_xml())
+    mujoco.MjModel.from_xml_path(str(path))
+    return notes
+
+
+def replayer_view(chain: Chain) -> Any:
+    """What Report needs to draw: signals, windows, and the clock."""
+    return SimpleNamespace(
+        signals=chain.groups["observation"] + chain.groups["drive"],
+        windows=chain.windows,
+        dt=chain.task.control_dt,
+        episodes=[SimpleNamespace(name=e.name, seconds=len(e.action) * chain.task.control_dt) for e in chain.episodes],
+    )

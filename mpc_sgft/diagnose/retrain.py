@@ -1,0 +1,109 @@
+"""Close the loop: go on pretraining in the repaired simulator, deploy again, and compare.
+
+The gap of the run is handed to the second deployment alone, as a robot would be: diagnosis and retraining know only
+what was found.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf, open_dict
+
+from mpc_sgft.diagnose.deployment import run_config
+from mpc_sgft.errors import UserError
+
+TARGET = 0.95  # success that counts as solved
+HEAD = "              |  zero-shot |    final | rollouts to 95 %"
+
+
+def retrain(run: Path, effects: Mapping[str, Mapping[str, Any]], out: Path, transitions: int) -> dict[str, Any]:
+    """Pretrain from the run's own start with the found effects, deploy again; returns the comparison.
+
+    Args:
+        run: Folder of the finished first deployment.
+        effects: {effect: parameters} that diagnose found.
+        out: Folder for `pretrain/`, `deploy/` and retrain.json.
+        transitions: Of pretraining in the repaired simulator.
+
+    Raises:
+        UserError: If the run was not finished, or a folder of an earlier retraining is in the way.
+    """
+    from mpc_sgft.deploy_loop import deploy
+    from mpc_sgft.pretrain_loop import pretrain
+
+    cfg, before = run_config(run), outcome(run)
+    _finish(pretrain(pretrain_config(cfg, effects, out / "pretrain", transitions)), "pretraining")
+    again = OmegaConf.create(OmegaConf.to_container(cfg, resolve=True))
+    assert isinstance(again, DictConfig)
+    again.checkpoint, again.run_dir, again.resume = str(out / "pretrain"), str(out / "deploy"), None
+    _finish(deploy(again), "the second deployment")
+    result = {"transitions": transitions, "before": before, "after": outcome(out / "deploy")}
+    (out / "retrain.json").write_text(json.dumps(result, indent=2) + "\n")
+    return result
+
+
+def pretrain_config(cfg: DictConfig, effects: Mapping[str, Any], folder: Path, transitions: int) -> DictConfig:
+    """The config of pretraining in the repaired simulator, from the config of a deployment.
+
+    Args:
+        cfg: Of the deployment; its gap is not used.
+        effects: Of the repaired simulator.
+        folder: Run folder to write.
+        transitions: How long.
+    """
+    from mpc_sgft import build, compose
+
+    task = str(cfg.chosen.task)
+    made = compose.compose("pretrain", [f"task={task}"], [])
+    with open_dict(made):
+        made.task, made.planner, made.seed, made.device = cfg.task, cfg.planner, cfg.seed, cfg.device
+        made.checkpoint = cfg.checkpoint if cfg.checkpoint is not None else str(build.shipped(task))
+        made.gap.effects = dict(effects)
+        made.chosen.gap = "+".join(["none", *effects])
+        made.run_dir, made.quiet = str(folder), cfg.quiet
+        made.transitions = made.min_transitions = transitions
+        made.eval_episodes = made.final_episodes = cfg.eval_episodes
+        made.random_transitions = 0  # the policy prior collects from the first round on
+        made.lr_halves_every = max(1, transitions // 2)
+    OmegaConf.resolve(made)
+    return made
+
+
+def outcome(run: Path) -> dict[str, Any]:
+    """Zero-shot and final success of a finished deployment, and real rollouts until 95 % (null if never).
+
+    Raises:
+        UserError: If it has no summary yet.
+    """
+    path = run / "summary.json"
+    if not path.is_file():
+        raise UserError(
+            f"{run}: no summary.json, the deployment was not finished. Go on: python -m mpc_sgft.deploy --resume {run}"
+        )
+    summary = json.loads(path.read_text())
+    reached = [int(k) for k, success in summary["curve"].items() if success >= TARGET]
+    return {
+        "zero_shot_success": summary["zero_shot_success"],
+        "final_success": summary["final_success"],
+        "real_rollouts": summary["real_rollouts"],
+        "rollouts_to_95": min(reached) if reached else None,
+    }
+
+
+def table(result: Mapping[str, Any]) -> str:
+    """The comparison for the terminal."""
+    lines = [HEAD]
+    for name, row in (("before repair", result["before"]), ("after repair", result["after"])):
+        count = row["rollouts_to_95"]
+        more = f"> {row['real_rollouts']}" if count is None else str(count)
+        lines.append(f"{name:13} | {row['zero_shot_success']:10.0%} | {row['final_success']:8.0%} | {more:>16}")
+    return "\n".join(lines)
+
+
+def _finish(code: int, what: str) -> None:
+    if code:
+        raise UserError(f"{what} ended with exit code {code}; see the messages above.")

@@ -1,0 +1,115 @@
+"""What deploy recorded tells the gap, which is never read; and what is told of folders that cannot be used."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+import yaml
+
+from envs.effects import load
+from mpc_sgft.diagnose.__main__ import main
+from mpc_sgft.diagnose.deployed import diagnose_run
+from mpc_sgft.diagnose.deployment import read_deployment
+from mpc_sgft.diagnose.drive import Commands, measured_drive
+from mpc_sgft.errors import UserError
+from mpc_sgft.record import read_episode
+
+FEW = ["actuator_gain", "frame_rotation", "actuator_delay", "contact_friction"]
+
+
+@pytest.mark.slow
+def test_a_turned_and_weak_machine_is_named_and_repaired(deployed, tmp_path: Path, check_report) -> None:
+    out = tmp_path / "out"
+    run = deployed({"actuator_gain": {"gain": 0.7}, "frame_rotation": {"angle": 0.5, "at": "base"}})
+    report = diagnose_run(run, out=out, effects=["actuator_gain", "frame_rotation", "actuator_delay"]).as_dict()
+    check_report(report)
+    assert report["verdict"] == "effect", report["reason"]
+    found = {e["name"]: e for e in report["effects"]}
+    assert set(found) == {"actuator_gain", "frame_rotation"} and found["frame_rotation"]["at"] == ["base"]
+    assert abs(found["actuator_gain"]["parameters"]["gain"]["value"] - 0.7) < 0.01
+    assert abs(found["frame_rotation"]["parameters"]["angle"]["value"] - 0.5) < 0.01
+    assert report["held_out"]["low"] > 0.9
+    mapping = yaml.safe_load((out / "effects.yaml").read_text())["effects"]
+    assert {type(e).__name__ for e in load(mapping)} == {"ActuatorGain", "FrameRotation"}
+    mujoco.MjModel.from_xml_path(str(out / "repaired.xml"))
+    assert any("MJCF cannot carry it" in note for note in report["notes"])
+    assert json.loads((out / "report.json").read_text()) == json.loads(json.dumps(report))
+    assert "data:image/svg+xml" in (out / "report.html").read_text() and (out / "report.rrd").stat().st_size > 1000
+
+
+def test_ice_is_named_by_how_far_the_puck_slides(deployed) -> None:
+    run = deployed({"contact_friction": {"coefficient": 0.05, "at": ["puck"]}}, episodes=5)
+    report = diagnose_run(run, effects=["actuator_gain", "contact_friction"]).as_dict()
+    (effect,) = report["effects"]
+    assert report["verdict"] == "effect" and effect["name"] == "contact_friction", report["reason"]
+    assert abs(effect["parameters"]["coefficient"]["value"] - 0.05) < 0.02
+
+
+def test_a_right_simulator_has_no_effect(deployed, check_report) -> None:
+    report = diagnose_run(deployed({}), effects=FEW, max_effects=1).as_dict()
+    check_report(report)
+    assert report["verdict"] == "none" and report["effects"] == [], report["reason"]
+
+
+def test_force_tells_what_reached_the_servos_and_the_recording_does_not(deployed) -> None:
+    gap = {"actuator_gain": {"gain": 0.5}, "actuator_delay": {"delay": 0.1}, "actuator_lag": {"time_constant": 0.05}}
+    run = deployed(gap, episodes=1)
+    deployment = read_deployment(run)
+    (episode,), task = deployment.episodes, deployment.task
+    meant, true = Commands(task, [episode]).drive([(), tuple(load(gap))])[:, 0, 1::2]  # [S, nu], as sampled
+    drive = measured_drive(task.spec().compile(), episode)
+    assert np.sqrt(np.mean((drive - true) ** 2)) < 1e-3 < 0.05 < np.sqrt(np.mean((drive - meant) ** 2))
+    recorded = read_episode(run / "episodes" / "0001.mcap").joints["ctrl"]
+    assert np.abs(recorded - meant).max() < 2e-3
+
+
+def test_a_cut_episode_is_read_as_far_as_it_is_whole(deployed) -> None:
+    run = deployed({}, episodes=2)
+    path = run / "episodes" / "0002.mcap"
+    path.write_bytes(path.read_bytes()[: int(0.6 * path.stat().st_size)])
+    deployment = read_deployment(run)
+    assert [len(e.action) for e in deployment.episodes][0] == 40 and 10 < len(deployment.episodes[1].action) < 40
+    assert "0002.mcap: it ends in the middle of a record" in deployment.notes[0]
+
+
+def test_folders_that_are_no_deployment(tmp_path: Path, deployed) -> None:
+    with pytest.raises(UserError, match="no such folder"):
+        read_deployment(tmp_path / "nowhere")
+    with pytest.raises(UserError, match="no config.yaml in it"):
+        read_deployment(tmp_path)
+    (tmp_path / "config.yaml").write_text("command: pretrain\n")
+    with pytest.raises(UserError, match="pretrain wrote it. Only deployments hold real episodes"):
+        read_deployment(tmp_path)
+    (tmp_path / "config.yaml").write_text("command: deploy\n")
+    with pytest.raises(UserError, match="names no task"):
+        read_deployment(tmp_path)
+    run = deployed({}, episodes=1, steps=3)
+    with pytest.raises(UserError, match="no episode has 10 whole steps. 0001.mcap: only 3 whole steps"):
+        read_deployment(run)
+    (run / "episodes" / "0001.mcap").write_bytes(b"not an episode")
+    with pytest.raises(UserError, match="not an MCAP file"):
+        read_deployment(run)
+    (run / "episodes" / "0001.mcap").unlink()
+    with pytest.raises(UserError, match="no episodes in"):
+        read_deployment(run)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--model", "x.xml"], "--model does not go with --run"),
+        (["--retrain"], "the deployment was not finished"),
+        (["--retrain", "--retrain-transitions", "0"], "a whole number from 1 on"),
+        (["--effects", "backlash"], "unknown effect 'backlash'"),
+        (["--window", "-1"], "--window -1.0: a length in seconds above 0"),
+        (["--max-effects", "0"], "at least one effect must be allowed"),
+    ],
+)
+def test_options_that_do_not_go_together(words: list[str], message: str, deployed, capsys) -> None:
+    run = deployed({}, episodes=3, steps=30)
+    assert main(["--run", str(run), *words]) == 2
+    assert message in capsys.readouterr().err
