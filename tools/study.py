@@ -39,7 +39,9 @@ def main() -> None:
     def work(job: tuple[int, str, str, str]) -> dict | None:
         seed, gap, method, variant = job
         checkpoint = args.checkpoints[seed % len(args.checkpoints)]
-        label = "-".join(str(x).replace("/", "_") for x in (args.csv.stem, gap, method, variant, seed) if x != "")
+        label = "-".join(
+            str(x).translate(str.maketrans("/=", "__")) for x in (args.csv.stem, gap, method, variant, seed) if x != ""
+        )
         folder = args.runs / label
         words = [f"gap={gap}", f"method={method}", f"seed={seed}", f"run_dir={folder}", "log.rerun=false", "quiet=true"]
         words += [variant] if variant else []
