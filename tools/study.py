@@ -1,7 +1,7 @@
 """Run many deployments, side by side and resumable, and collect their learning curves into one CSV.
 
-    python tools/study.py results/transfer.csv --gaps turned late ice --methods sgft tdmpc2 --seeds 0 1 2 3 4
-    python tools/study.py results/horizon.csv --gaps late --seeds 0 1 --variants horizon=1 horizon=2 horizon=4 horizon=8
+    python tools/study.py results/transfer.csv --gaps turned sluggish glide --methods sgft tdmpc2 --seeds 0 1 2 3 4
+    python tools/study.py results/horizon.csv --gaps sluggish --seeds 0 1 --variants horizon=1 horizon=2 horizon=4
 
 Each run is `python -m mpc_sgft.deploy` in a process of its own with one thread; its folder is kept under --runs, and a
 run whose summary is there is not repeated. With several --checkpoints, seed s uses number s modulo their count.
