@@ -3,23 +3,26 @@
 import json
 import time
 from contextlib import closing
+from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig
 
 from envs.backends.base import BackendError
 from envs.env import ControlEnv
-from mpc_sgft import build, checkpoint, robot, run_folder
+from mpc_sgft import build, checkpoint, person, robot, run_folder
 from mpc_sgft.agent import Agent
 from mpc_sgft.audit import audit, write_audit
-from mpc_sgft.drive import Rollout, drive, from_episode
+from mpc_sgft.drive import Rollout, begin, drive, from_episode
 from mpc_sgft.errors import Stopped, UserError
 from mpc_sgft.log import GrowingTable, MetricLogger, progress
+from mpc_sgft.operator import Nobody, Operator
 from mpc_sgft.pretrain_loop import EVAL_SEED, StopRequest
 from mpc_sgft.record import read_episode
 from mpc_sgft.rollout import Score, collect, planner_policy, score, score_of
 from mpc_sgft.show import DeployViewer
 from mpc_sgft.transfer import Transfer, open_loop_error
+from mpc_sgft.verdicts import Verdicts
 from planners.policy import PolicyPlanner
 
 REAL_SEED = 2_000_000  # real rollouts never share a seed with evaluation or pretraining
@@ -28,26 +31,33 @@ REAL_SEED = 2_000_000  # real rollouts never share a seed with evaluation or pre
 def deploy(cfg: DictConfig) -> int:
     """Adapt a pretrained agent with real rollouts; returns the exit code."""
     agent, _ = build.load_agent(cfg)
-    real = cfg.backend.name == "franka"
-    env = robot.make_env(cfg) if real else build.make_env(cfg, 1)
-    with closing(env.backend):
-        build.check_fits(agent.model, env)
+    real, operator = cfg.backend.name == "franka", person.make_operator(cfg)
+    env = robot.make_env(cfg, operator.place) if real else build.make_env(cfg, 1)
+    build.check_fits(agent.model, env)
+    with operator, closing(env.backend):
         if real:
-            robot.connect(env)
+            robot.connect(env, operator)
         if real and cfg.backend.dry_run:
             return robot.dry_run(cfg, agent.model, env)
-        run = Deployment(cfg, agent, env, None if real else build.make_env(cfg, cfg.eval_episodes))
+        run = Deployment(cfg, agent, env, None if real else build.make_env(cfg, cfg.eval_episodes), operator)
         try:
-            return run.loop()
+            summary = run.loop()
         except BackendError as error:
+            if operator.stopping:
+                raise Stopped(run.how_to_go_on()) from error
             raise UserError(f"{error} {run.how_to_go_on()}") from error
+    print(json.dumps(summary))
+    return 0
 
 
 class Deployment:
     """State of one deployment and its folder. Without a judge, the real rollouts themselves are the measure."""
 
-    def __init__(self, cfg: DictConfig, agent: Agent, env: ControlEnv, judge: ControlEnv | None):
+    def __init__(
+        self, cfg: DictConfig, agent: Agent, env: ControlEnv, judge: ControlEnv | None, operator: Operator | None = None
+    ):
         self.cfg, self.env, self.judge = cfg, env, judge
+        self.operator: Operator = operator or Nobody(quiet=cfg.quiet)
         self.folder = run_folder.start(cfg)
         (self.folder / "episodes").mkdir(exist_ok=True)
         build.prepare_process(cfg)
@@ -68,62 +78,87 @@ class Deployment:
             memory=t.gate_memory,
         )
         self.state: dict[str, Any] = {"rollouts": 0, "aborted": 0, "scores": {}, "seconds": 0.0, "successes": 0}
+        self.state |= {"interventions": 0, "rerecorded": 0}
         self.state["outcomes"] = []  # (success, return) of each real rollout
         if cfg.resume is not None:
             self._resume()
-        self.logger = MetricLogger(
-            self.folder,
-            csv=cfg.log.csv,
-            tensorboard=cfg.log.tensorboard,
-            wandb=cfg.log.wandb,
-            resume_step=self.state["rollouts"] if cfg.resume is not None else None,
-        )
+        self.logger = self.make_logger(self.state["rollouts"] if cfg.resume is not None else None)
+        self.metrics: dict[str, float] = {}  # of the last rollout
+        self.verdicts = Verdicts(self, ask=person.asks(cfg))
+        self.stop = StopRequest("rollout")
         self.viewer = (
             DeployViewer(self.folder / "run.rrd", env, resume=cfg.resume is not None) if cfg.log.rerun else None
         )
         self.began = time.monotonic() - self.state["seconds"]
 
-    def loop(self) -> int:
+    def loop(self) -> dict[str, Any]:
         """Run what is left, and write the summary."""
-        cfg, stop, table = self.cfg, StopRequest("rollout"), None if self.cfg.quiet else GrowingTable()
+        cfg, table = self.cfg, None if self.cfg.quiet else GrowingTable()
         if self.judge and not self.state["scores"]:
-            self._evaluate(table, {})
-            self._save()
+            self.evaluate(table, {})
+            self.save()
         if self.viewer:
             self.viewer.value_map("before", self.transfer.acting)
-        bar = progress(
-            cfg.rollouts, initial=self.state["rollouts"], desc=f"deploy {cfg.method}", unit="rollout", disable=cfg.quiet
-        )
+        hidden = cfg.quiet or self.operator.present  # the page shows the same
+        done = self.state["rollouts"]
+        bar = progress(cfg.rollouts, initial=done, desc=f"deploy {cfg.method}", unit="rollout", disable=hidden)
+        self.show_counts()
         while self.state["rollouts"] < cfg.rollouts:
             number = self.state["rollouts"] + 1
             rollout = self._rollout(number)
-            metrics = self._measure(rollout, number)
-            valid = rollout.steps[~rollout.steps["next", "invalid"][:, 0]]
-            if len(valid) >= cfg.train.replay.slice_len:
-                metrics |= self.transfer.learn(valid)
-            self.state["rollouts"] = number
-            self.state["aborted"] += rollout.aborted is not None
-            self.state["successes"] += rollout.success
-            self.state["outcomes"].append((rollout.success, metrics["real_return"]))
-            if number % cfg.eval_every == 0 or number == cfg.rollouts:
-                self._evaluate(table, metrics)
-            self.logger.log(number, metrics)
-            self._save()
-            bar.update(1)
-            bar.set_postfix(real_success=f"{self.state['successes']}/{number}")
-            if stop.asked:
+            if rollout is not None:
+                rollout = self.verdicts.of(rollout, number)
+            if self.operator.stopping:
+                raise Stopped(self.how_to_go_on())  # what was recorded counts when the session goes on
+            if rollout is None:
+                continue
+            self._count(rollout, number, table)
+            self.operator.rest()
+            self.verdicts.late(number)
+            bar.update(self.state["rollouts"] - bar.n)
+            bar.set_postfix(real_success=f"{self.state['successes']}/{self.state['rollouts']}")
+            if self.stop.asked or self.operator.stopping:
                 raise Stopped(self.how_to_go_on())
         bar.close()
         return self._finish()
+
+    def _count(self, rollout: Rollout, number: int, table: GrowingTable | None) -> None:
+        """Measure a rollout, learn from it unless a person had the arm, and save."""
+        if self.operator.present:
+            self.verdicts.remember()
+        self.operator.enter("measuring", number)
+        metrics = self._measure(rollout, number)
+        valid = rollout.steps[~rollout.steps["next", "invalid"][:, 0]]
+        if len(valid) >= self.cfg.train.replay.slice_len and not rollout.intervened:
+            self.operator.enter("training", number)
+            metrics |= self.transfer.learn(valid, self.operator.track)
+        self.state["rollouts"] = number
+        self.state["aborted"] += rollout.aborted is not None
+        self.state["interventions"] += rollout.intervened
+        self.state["successes"] += rollout.success
+        self.state["outcomes"].append((rollout.success, metrics["real_return"]))
+        if number % self.cfg.eval_every == 0 or number == self.cfg.rollouts:
+            self.evaluate(table, metrics)
+        self.logger.log(number, metrics)
+        self.metrics = metrics
+        self.save()
+        self.show_counts()
 
     def how_to_go_on(self) -> str:
         """What is saved, and the command that continues."""
         done = self.state["rollouts"]
         return f"saved after {done} rollouts. Go on: python -m mpc_sgft.deploy --resume {self.folder}"
 
-    def _rollout(self, number: int) -> Rollout:
-        """The next real rollout; one that a killed process recorded is used as it is, not driven again."""
-        cfg, path = self.cfg, self.folder / "episodes" / f"{number:04d}.mcap"
+    def path(self, number: int) -> Path:
+        """Where a rollout is recorded."""
+        return self.folder / "episodes" / f"{number:04d}.mcap"
+
+    def _rollout(self, number: int) -> Rollout | None:
+        """The next real rollout, or None if the one before is to be driven again first.
+
+        One that a killed process recorded is used as it is, not driven again.
+        """
+        cfg, path = self.cfg, self.path(number)
         if path.exists():
             episode = read_episode(path)
             if episode.transitions:
@@ -135,15 +170,39 @@ class Deployment:
                 action_dim=self.env.action_dim, horizon=cfg.planner.horizon, discount=cfg.task.discount
             )
         model = self.transfer.pretrained if number <= cfg.warmup else self.transfer.acting
+        seed = REAL_SEED + 1000 * cfg.seed + number
+        self.operator.enter("resetting", number - 1)
+        try:
+            state = begin(self.env, seed)
+        except BackendError:
+            self.verdicts.late(number - 1)
+            raise
+        if self.verdicts.again(number - 1):
+            return None
         return drive(
             self.env,
             model,
             planner,
             path,
             number=number,
-            seed=REAL_SEED + 1000 * cfg.seed + number,
+            seed=seed,
             noise=cfg.transfer.action_noise,
             candidate_steps=tuple(cfg.candidate_steps),
+            operator=self.operator,
+            state=state,
+        )
+
+    def show_counts(self) -> None:
+        """Tell the operator how the session stands."""
+        s = self.state
+        text = f"{s['successes']} of {s['rollouts']}, {s['aborted']} aborted, {s['interventions']} taken over"
+        self.operator.tell(successes=f"{text}, {s['rerecorded']} driven again")
+
+    def make_logger(self, resume_step: int | None) -> MetricLogger:
+        """For metrics from here on; rows after `resume_step` are dropped."""
+        log = self.cfg.log
+        return MetricLogger(
+            self.folder, csv=log.csv, tensorboard=log.tensorboard, wandb=log.wandb, resume_step=resume_step
         )
 
     def _measure(self, rollout: Rollout, number: int) -> dict[str, float]:
@@ -165,7 +224,8 @@ class Deployment:
             self.viewer.episode(rollout, model, error, number, self.cfg.task.discount)
         return metrics
 
-    def _evaluate(self, table: GrowingTable | None, metrics: dict[str, float]) -> None:
+    def evaluate(self, table: GrowingTable | None, metrics: dict[str, float]) -> None:
+        """Measure success now: into the state, `metrics` and the table."""
         result = self._score()
         self.state["scores"][self.state["rollouts"]] = result._asdict()
         metrics |= {"success": result.success, "return": result.episode_return}
@@ -190,7 +250,8 @@ class Deployment:
         act = planner_policy(self.transfer.acting, self.planner, EVAL_SEED)
         return score(collect(self.judge, act, seed=EVAL_SEED))
 
-    def _save(self) -> None:
+    def save(self) -> None:
+        """Weights and exact state."""
         self.state["seconds"] = time.monotonic() - self.began
         path = self.folder / "checkpoint"
         meta = checkpoint.describe(self.cfg, self.transfer.acting)
@@ -204,7 +265,7 @@ class Deployment:
             self.state |= stored["loop"]
             self.transfer.load_state_dict(stored["transfer"])
 
-    def _finish(self) -> int:
+    def _finish(self) -> dict[str, Any]:
         agent = self.transfer.agent
         if agent.frozen_hash() != self.frozen:
             raise AssertionError("a frozen tensor changed during deployment; this is a defect, please report it")
@@ -220,6 +281,8 @@ class Deployment:
             "seed": cfg.seed,
             "real_rollouts": self.state["rollouts"],
             "aborted_rollouts": self.state["aborted"],
+            "interventions": self.state["interventions"],
+            "rerecorded": self.state["rerecorded"],
             "zero_shot_success": scores[0]["success"] if 0 in scores else None,
             "final_success": scores[max(scores)]["success"],
             "final_interval": [scores[max(scores)]["success_low"], scores[max(scores)]["success_high"]],
@@ -234,5 +297,4 @@ class Deployment:
         }
         (self.folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
         self.logger.close()
-        print(json.dumps(summary))
-        return 0
+        return summary

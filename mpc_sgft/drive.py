@@ -10,6 +10,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from envs.env import ControlEnv
+from mpc_sgft.operator import Nobody, Operator, Press
 from mpc_sgft.record import Episode, EpisodeWriter
 from mpc_sgft.world_model import WorldModel
 from planners.base import Plan
@@ -27,6 +28,8 @@ class Rollout(NamedTuple):
         candidates: Of selected steps, (t, plans [N, H, A], values [N]).
         success: Whether the goal held at the end.
         aborted: Why the episode ended before its time, or None.
+        keys: What a person pressed meanwhile.
+        intervened: Whether a person took the arm over; then nothing is learned from the episode.
     """
 
     steps: TensorDict
@@ -37,6 +40,8 @@ class Rollout(NamedTuple):
     candidates: list[tuple[int, Tensor, Tensor]]
     success: bool
     aborted: str | None
+    keys: tuple[Press, ...] = ()
+    intervened: bool = False
 
 
 def drive(
@@ -49,6 +54,8 @@ def drive(
     seed: int,
     noise: float,
     candidate_steps: tuple[int, ...],
+    operator: Operator | None = None,
+    state: TensorDict | None = None,
 ) -> Rollout:
     """Run one episode on a backend with a single environment, each step on disk before the next begins.
 
@@ -60,17 +67,28 @@ def drive(
         seed: Of the start, the planner and the noise.
         noise: Standard deviation of Gaussian noise added to each action.
         candidate_steps: Steps whose candidate plans are kept.
+        operator: Who watches; nobody if None.
+        state: First observation of an episode that `begin` began; None begins it here.
     """
+    operator = operator or Nobody()
     task, device = env.task, next(model.parameters()).device
     generator = torch.Generator(device).manual_seed(seed)
     noise_generator = torch.Generator().manual_seed(seed + 1)
-    env.set_seed(seed)
-    state, plan = env.reset(), None
+    state = begin(env, seed) if state is None else state
+    plan: Plan | None = None
     first = env.backend.positions()
     rows, plans, values, plan_ms, candidates = [], [], [], [], []
     qpos: list[Any] = [] if first is None else [first]
-    aborted, meta = None, {"task": task.name, "seed": seed, "control_dt": task.control_dt, **env.backend.describe()}
+    aborted, keys, meta = None, [], {"task": task.name, "seed": seed, "control_dt": task.control_dt}
+    meta |= {"began_unix": time.time(), **env.backend.describe()}
+
+    def listen(writer: EpisodeWriter) -> None:
+        for press in operator.poll():
+            keys.append(press)
+            writer.key(press.word, time=press.unix - meta["began_unix"], unix=press.unix)
+
     with EpisodeWriter(path, meta) as writer:
+        operator.enter("running", number)
         for t in range(task.episode_steps):
             began = time.perf_counter()
             keep = t in candidate_steps
@@ -80,6 +98,8 @@ def drive(
             state["action"] = action.clamp(-1, 1)
             row, state = _step(env, state, number, t)
             writer.step({**_transition(row, t, task.control_dt), "note": env.backend.note}, env.backend.samples())
+            listen(writer)
+            operator.tell(step=f"{t + 1} of {task.episode_steps}", note=env.backend.note)
             rows.append(row[0])
             plans.append(plan.mean[0].cpu())
             values.append(plan.value[0].cpu())
@@ -91,9 +111,16 @@ def drive(
                 aborted = env.backend.note or "the step is invalid"
             if row["next", "done"].item():
                 break
+        while aborted and operator.guiding:
+            writer.guided(env.backend.guided())
+            listen(writer)
+        operator.enter("ending", number)  # nothing can be taken over from here on
+        listen(writer)
         steps = cast(TensorDict, TensorDict.stack(rows))
+        intervened = aborted is not None and any(press.word == "takeover" for press in keys)
         success = bool(steps["next", "success"][-1])
-        writer.close({"success": success, "return": float(steps["next", "reward"].sum()), "aborted": aborted})
+        outcome = {"success": success, "return": float(steps["next", "reward"].sum()), "aborted": aborted}
+        writer.close(outcome | {"intervened": intervened})
     return Rollout(
         steps=steps,
         qpos=np.stack(qpos) if qpos else None,
@@ -103,7 +130,15 @@ def drive(
         candidates=candidates,
         success=success,
         aborted=aborted,
+        keys=tuple(keys),
+        intervened=intervened,
     )
+
+
+def begin(env: ControlEnv, seed: int) -> TensorDict:
+    """Start an episode: its first observation."""
+    env.set_seed(seed)
+    return env.reset()
 
 
 def from_episode(episode: Episode, number: int) -> Rollout:
@@ -141,9 +176,12 @@ def from_episode(episode: Episode, number: int) -> Rollout:
         },
         [count],
     )
-    aborted = "cut off" if not episode.complete else (episode.outcome or {}).get("aborted")
-    success = bool(episode.complete and flags["success"][-1])
-    return Rollout(steps, None, None, None, None, [], success, aborted)
+    outcome = episode.outcome or {}
+    aborted = outcome.get("aborted") if episode.complete else "cut off"
+    success = bool(episode.complete and outcome.get("success", flags["success"][-1]))
+    keys = tuple(Press(row["key"], row["unix"], number) for row in episode.keys)
+    intervened = bool(outcome.get("intervened") or episode.guided)
+    return Rollout(steps, None, None, None, None, [], success, aborted, keys, intervened)
 
 
 @torch.inference_mode()

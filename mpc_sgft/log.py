@@ -166,7 +166,9 @@ def _wandb_run(run_dir: Path, resume_step: int | None) -> Any:
     return wandb.init(project="mpc_sgft", id=name, name=name, dir=str(run_dir), resume=resume)
 
 
-def progress(total: int, *, initial: int = 0, desc: str = "", unit: str = "step", disable: bool = False) -> tqdm:
+def progress(
+    total: int, *, initial: int = 0, desc: str = "", unit: str = "step", disable: bool = False, leave: bool = True
+) -> tqdm:
     """A progress bar with the time left; `bar.update(n)` moves it, `bar.set_postfix(success=0.4)` shows numbers.
 
     Goes to stderr. Where stderr is not a terminal it prints a line every ten seconds instead of redrawing.
@@ -178,6 +180,7 @@ def progress(total: int, *, initial: int = 0, desc: str = "", unit: str = "step"
         desc=desc,
         unit=unit,
         disable=disable,
+        leave=leave,
         dynamic_ncols=terminal,
         mininterval=0.2 if terminal else 10.0,
         ncols=None if terminal else 100,

@@ -6,6 +6,8 @@
 | `/transition` | control step    | TRANSITION_KEYS and whatever else the caller passes, such as `next_observation`   |
 | `/joints`     | control step    | S samples inside the step: time [S], qpos [S,nq], qvel [S,nv], ctrl, force [S,nu] |
 | `/outcome`    | episode         | what close() was given                                                            |
+| `/keys`       | key             | key, a word of mpc_sgft/operator.py; time [s]; unix [s]                           |
+| `/guided`     | control period  | S samples while a person moves the arm: time, qpos, qvel, force, object [S,3] m   |
 
 Messages are JSON, so Foxglove, `mcap cat` and ten lines of any language can read them. The messages of one step share
 one chunk with a checksum: a step is in the file completely or not at all. Times are seconds since the episode's start.
@@ -40,7 +42,7 @@ TRANSITION_KEYS = (
 )
 JOINT_KEYS = ("time", "qpos", "qvel", "ctrl", "force")
 HIDDEN_KEYS = ("gap", "effects")
-TOPICS = ("/metadata", "/transition", "/joints", "/outcome")
+TOPICS = ("/metadata", "/transition", "/joints", "/outcome", "/keys", "/guided")
 
 
 class Episode(NamedTuple):
@@ -53,6 +55,8 @@ class Episode(NamedTuple):
         outcome: As given to close(), None if the episode was never closed.
         complete: Whether the file was closed by its writer and is whole.
         lost: None if complete, otherwise what is missing, in words.
+        keys: What a person pressed, in order.
+        guided: Key -> [sum of S, …], samples of a person moving the arm; empty if nobody did.
     """
 
     metadata: dict[str, Any]
@@ -61,6 +65,18 @@ class Episode(NamedTuple):
     outcome: dict[str, Any] | None
     complete: bool
     lost: str | None
+    keys: list[dict[str, Any]] = []
+    guided: dict[str, np.ndarray] = {}
+
+
+class Scan(NamedTuple):
+    """What is whole in a file: (topic, time [ns], JSON) of each message, and how the file ends."""
+
+    messages: list[tuple[str, int, bytes]]
+    closed: bool
+    problem: str  # empty if there is none
+    unreadable: int  # bytes
+    size: int  # bytes
 
 
 class EpisodeWriter:
@@ -127,6 +143,20 @@ class EpisodeWriter:
         self._write(messages)
         self.steps += 1
 
+    def key(self, word: str, *, time: float, unix: float) -> None:
+        """Append a key that a person pressed: when since the episode's start, and by the computer's clock, [s]."""
+        self._write({"/keys": _dumps({"key": word, "time": time, "unix": unix})})
+
+    def guided(self, samples: Mapping[str, Any]) -> None:
+        """Append what was measured while a person moved the arm, each [S, …]."""
+        arrays = {key: np.asarray(value) for key, value in samples.items()}
+        self._write({"/guided": _dumps({key: array.tolist() for key, array in arrays.items()}, arrays)})
+
+    def copy(self, topic: str, time: int, data: bytes) -> None:
+        """Append a message of another episode as it is."""
+        self._time = time  # [ns]
+        self._write({topic: data.decode()})
+
     def close(self, outcome: Mapping[str, Any]) -> None:
         """Write the outcome (success, return, reason it ended, …) and the file's index, then close it."""
         self._write({"/outcome": _dumps(outcome)})
@@ -185,10 +215,36 @@ def read_episode(path: str | Path) -> Episode:
         ValueError: If the file is not an MCAP episode at all.
         OSError: If it cannot be opened.
     """
+    found = scan(path)
+    messages: dict[str, list[dict[str, Any]]] = {topic: [] for topic in TOPICS}
+    for topic, _, data in found.messages:
+        messages[topic].append(json.loads(data))
+    steps = len(messages["/transition"])
+    complete = found.closed and not found.problem and bool(messages["/outcome"])
+    lost = f"{found.problem}: {steps} whole steps kept, the last {found.unreadable} of {found.size} bytes unreadable"
+    return Episode(
+        metadata=messages["/metadata"][0] if messages["/metadata"] else {},
+        transitions=_stack([{k: [v] for k, v in row.items()} for row in messages["/transition"]]),
+        joints=_stack(messages["/joints"]),
+        outcome=messages["/outcome"][0] if messages["/outcome"] else None,
+        complete=complete,
+        lost=None if complete else lost,
+        keys=messages["/keys"],
+        guided=_stack(messages["/guided"]),
+    )
+
+
+def scan(path: str | Path) -> Scan:
+    """The whole messages of a file, and how it ends.
+
+    Raises:
+        ValueError: If the file is not an MCAP episode at all.
+        OSError: If it cannot be opened.
+    """
     path = Path(path)
     size = path.stat().st_size
     topics: dict[int, str] = {}
-    messages: dict[str, list[dict[str, Any]]] = {topic: [] for topic in TOPICS}
+    messages: list[tuple[str, int, bytes]] = []
     whole, closed, problem = 0, False, ""
     with path.open("rb") as file:
         head = file.read(len(MCAP0_MAGIC))
@@ -201,8 +257,8 @@ def read_episode(path: str | Path) -> Episode:
                 whole = file.tell()
                 if isinstance(record, Channel):
                     topics[record.id] = record.topic
-                elif isinstance(record, Message) and topics.get(record.channel_id) in messages:
-                    messages[topics[record.channel_id]].append(json.loads(record.data))
+                elif isinstance(record, Message) and topics.get(record.channel_id) in TOPICS:
+                    messages.append((topics[record.channel_id], record.log_time, record.data))
                 closed = isinstance(record, Footer)
         except EndOfFile:
             problem = "it was never closed" if whole == size else "it ends in the middle of a record"
@@ -210,18 +266,7 @@ def read_episode(path: str | Path) -> Episode:
             problem = f"it is damaged ({error})"
     if (topics or closed) and not set(TOPICS) & set(topics.values()):
         raise ValueError(f"{path} is an MCAP file without the topics {list(TOPICS)}: not an episode of this project.")
-    transitions = _stack([{k: [v] for k, v in row.items()} for row in messages["/transition"]])
-    steps = len(messages["/transition"])
-    complete = closed and not problem and bool(messages["/outcome"])
-    lost = f"{problem}: {steps} whole steps kept, the last {size - whole} of {size} bytes unreadable"
-    return Episode(
-        metadata=messages["/metadata"][0] if messages["/metadata"] else {},
-        transitions=transitions,
-        joints=_stack(messages["/joints"]),
-        outcome=messages["/outcome"][0] if messages["/outcome"] else None,
-        complete=complete,
-        lost=None if complete else lost,
-    )
+    return Scan(messages, closed, problem, size - whole, size)
 
 
 class _WholeReads:

@@ -1,7 +1,6 @@
 """From a config to a robot: the arm, its stand-in, what sees the object, and a rehearsal without moving."""
 
 import json
-import sys
 from typing import Any
 
 import numpy as np
@@ -21,18 +20,24 @@ from envs.stand_in.client import StandIn
 from mpc_sgft import build, run_folder
 from mpc_sgft.drive import drive
 from mpc_sgft.errors import UserError, from_config
+from mpc_sgft.operator import Nobody, Operator
 from mpc_sgft.world_model import WorldModel
 
 STAND_IN = "stand-in"
 
 
-def make_env(cfg: DictConfig) -> ControlEnv:
-    """The task on the robot of `cfg.backend`, not connected yet; a stand-in is started here.
+def make_env(cfg: DictConfig, place: Place | None = None) -> ControlEnv:
+    """The task on the robot of `cfg.backend`, not connected yet; what sees the object is opened on connecting.
+
+    Args:
+        cfg: The run's config.
+        place: Has a person put the object somewhere; None asks for it in a line.
 
     Raises:
         UserError: For a task without a robot, a gap, a missing address, perception that does not go with it, a number
             that is not allowed, or a missing package.
     """
+    place = place or Nobody().place
     on_robot = cfg.task.get("on_robot")
     if on_robot is None:
         raise UserError(f"task={cfg.chosen.task} cannot run on the robot: configs/task/ gives it no on_robot.")
@@ -67,7 +72,7 @@ def make_env(cfg: DictConfig) -> ControlEnv:
             return stand_in, stand_in.scene.place
         with from_config("perception"):
             made = {key: value for key, value in cfg.perception.items() if key != "name"}
-            return instantiate(made, _convert_="all"), ask_person if cfg.perception.name != "fixed" else None
+            return instantiate(made, _convert_="all"), place if cfg.perception.name != "fixed" else None
 
     with from_config("backend"):
         gate = Gate(limits, tool_length=task.tool_length, sample_dt=SAMPLE_DT)
@@ -77,13 +82,15 @@ def make_env(cfg: DictConfig) -> ControlEnv:
     return ControlEnv(backend, history=cfg.task.history)
 
 
-def connect(env: ControlEnv) -> None:
-    """Reach the robot.
+def connect(env: ControlEnv, operator: Operator) -> None:
+    """Reach the robot, which an operator may stop from now on.
 
     Raises:
         UserError: Why not, and what to check.
     """
     try:
+        env.backend.obey(operator.halt)  # type: ignore[attr-defined]
+        operator.watch(env.backend.status)  # type: ignore[attr-defined]
         env.backend.open()  # type: ignore[attr-defined]
     except (BackendError, PerceptionError) as error:
         raise UserError(str(error)) from error
@@ -120,15 +127,3 @@ def dry_run(cfg: DictConfig, model: WorldModel, env: ControlEnv) -> int:
     (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
     print(json.dumps(summary))
     return 0
-
-
-def ask_person(position: Any) -> None:
-    """Have somebody put the object somewhere, and wait until they say that it is there.
-
-    Raises:
-        BackendError: If nobody can answer.
-    """
-    x, y = (round(float(v), 2) for v in position[:2])
-    if not sys.stdin.isatty():
-        raise BackendError("somebody must put the object in its place, and no terminal is attached to ask them")
-    input(f"\nput the object at x = {x} m, y = {y} m from the robot's base, step back, then press Enter ")

@@ -8,6 +8,8 @@ do.
 """
 
 import copy
+from collections.abc import Callable, Iterable
+from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -54,7 +56,10 @@ class Transfer:
     ):
         self.agent, self.updates, self.gate, self.margin, self.memory = agent, updates, gate, margin, memory
         self.slice_len, self.anchor = slice_len, agent.anchor
-        self.buffer = make_buffer(capacity=capacity, slice_len=slice_len, batch_size=batch_size, seed=seed)
+        self._new_buffer = partial(
+            make_buffer, capacity=capacity, slice_len=slice_len, batch_size=batch_size, seed=seed
+        )
+        self.buffer = self._new_buffer()
         self.pretrained = copy.deepcopy(agent.model)
         self.acting: WorldModel = copy.deepcopy(agent.model)
         self.verdicts: list[Verdict] = []
@@ -72,13 +77,18 @@ class Transfer:
             self.verdicts[-1] = self.verdicts[-1]._replace(accepted=lower)
         return self.verdicts[-1]
 
-    def learn(self, steps: TensorDict) -> dict[str, float]:
-        """Judge a rollout [T], learn from all there are, and hand over the parts that may act; returns metrics."""
+    def learn(self, steps: TensorDict, track: Callable[[range], Iterable[int]] = iter) -> dict[str, float]:
+        """Judge a rollout [T], learn from all there are, and hand over the parts that may act; returns metrics.
+
+        Args:
+            steps: The rollout.
+            track: Shows how far the gradient steps are, as tqdm does.
+        """
         verdict = self.judge(steps)
         self.buffer.extend(steps)
         self.agent.anchor = self.anchor / len(self.verdicts)  # a prior weighs less, the more data there are
         metrics: dict[str, float] = {}
-        for _ in range(self.updates):
+        for _ in track(range(self.updates)):
             metrics = self.agent.update_transfer(self.buffer.sample())
         self.acting.load_state_dict((self.agent.model if verdict.accepted else self.pretrained).state_dict())
         return metrics | {"error_pretrained": verdict.pretrained, "error_fine_tuned": verdict.fine_tuned}
@@ -93,6 +103,7 @@ class Transfer:
 
     def load_state_dict(self, state: dict) -> None:
         self.agent.load_state_dict(state["agent"])
+        self.buffer = self._new_buffer()  # what is loaded may hold less than what is there
         self.buffer.load_state_dict(state["buffer"])
         self.acting.load_state_dict(state["acting"])
         self.verdicts = [Verdict(*v) for v in state["verdicts"]]

@@ -3,6 +3,7 @@
 import logging
 import time
 from collections import Counter
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -159,6 +160,44 @@ class FrankaBackend:
         counts = {"limited": self.counters["limited"], "waits": self.rig.waits, "faults": self.counters["faults"]}
         return {**self.pace.report(), **counts, "robot_rate": round(self.rig.rate, 3)}
 
+    def obey(self, asked: Callable[[], str]) -> None:
+        """From now on a person can stop the arm: `asked` says why, or nothing; the stream asks before each target."""
+        self.rig.asked = asked
+
+    def guided(self) -> dict[str, Array]:
+        """Watch for one period while a person moves the arm: nothing is sent, no controller runs.
+
+        Returns:
+            time [S] s since the episode's start, qpos, qvel, force [S, 7], object [S, 3] m in the base frame (nan
+            while it is not seen).
+
+        Raises:
+            BackendError: If the robot is not heard.
+        """
+        rows, unseen = [], np.full(3, np.nan)
+        end = time.monotonic() + self.task.control_dt
+        while time.monotonic() < end:
+            state, seen = self.rig.look_on()
+            place = unseen if seen is None else seen.position
+            rows.append((self.rig.clock.now() - self._zero, state.q, state.dq, state.torque, place))
+            time.sleep(self.gate.sample_dt / 2)
+        names = ("time", "qpos", "qvel", "force", "object")
+        return {name: np.array(column, float) for name, column in zip(names, zip(*rows, strict=True), strict=True)}
+
+    def status(self) -> dict[str, str]:
+        """What a person wants to see of the robot now, in words; asks nothing of it, so any thread may call."""
+        running, seen = self.rig.running, self.rig.seen
+        found = {"robot": "at rest", "tip": "-", "object": "not seen yet"}
+        if running is not None:
+            state = running.state
+            stopped = f", stopped: {running.doubt}" if running.doubt else ""
+            found["robot"] = f"{state.mode}{stopped}"
+            found["tip"] = "x {:.3f}  y {:.3f}  z {:.3f} m".format(*self.gate.tip(state.q))
+        if seen is not None:
+            age = time.monotonic() - seen.time
+            found["object"] = "x {:.3f}  y {:.3f} m, seen {:.1f} s ago".format(*seen.position[:2], age)
+        return found
+
     def close(self) -> None:
         """Stop the arm and disconnect."""
         self.rig.close()
@@ -201,7 +240,7 @@ class FrankaBackend:
         self._collect()
         said = self.rig.end()
         self.fault = self.note = f"{why} ({said})" if said and said not in why else why
-        self.counters["faults"] += 1
+        self.counters["by_person" if self.rig.by_person else "faults"] += 1
         log.warning("the arm was stopped: %s", self.note)
         return self._outcome(sent, invalid=True)
 

@@ -54,6 +54,9 @@ class Rig:
         self._perception: Perception | None = None
         self._place: Place | None = None
         self._warned = False
+        self.asked: Callable[[], str] = lambda: ""  # why a person wants the arm to stop, empty if nobody does
+        self.by_person = False  # the last doubt was a person's wish
+        self.seen: Detection | None = None  # last sight that was used
 
     def open(self) -> None:
         """Connect, and stand ready.
@@ -87,6 +90,9 @@ class Rig:
             told = state.q if self.dry_run else told
             tip = tip_position(state.q[None], self.gate.tool_length)[0]
             limits = self.gate.limits
+            if wish := self.asked():
+                self.by_person = True
+                return wish
             return doubt(limits, state_age=age, mode=state.mode, q=state.q, told=told, dq=state.dq, tip=tip)
 
         self.running = Stream(self.arm, self.clock, self.gate, doubt=watch, moves=not self.dry_run)
@@ -124,6 +130,7 @@ class Rig:
             seen = None if self._perception is None else self._perception.read()
             why = unseen(self.gate.limits, None if seen is None else time.monotonic() - seen.time)
             if seen is not None and not why:
+                self.seen = seen
                 return seen
             if time.monotonic() > deadline:
                 raise NotSafe(why)
@@ -133,6 +140,12 @@ class Rig:
                 self.waits += 1
                 log.warning("%s; the arm holds", why)
             time.sleep(0.01)
+
+    def look_on(self) -> tuple[ArmState, Detection | None]:
+        """The arm while nothing is sent to it, and the object if it is seen now."""
+        seen = None if self._perception is None else self._perception.read()
+        lost = unseen(self.gate.limits, None if seen is None else time.monotonic() - seen.time)
+        return self.arm.read(), None if lost else seen
 
     def end(self) -> str:
         """Bring the arm to rest; what the robot said about it, if anything."""
@@ -154,13 +167,15 @@ class Rig:
         return float(self.elapsed[0] / self.elapsed[1]) if self.elapsed[1] > 1.0 else 1.0
 
     def recover(self, reason: str) -> None:
-        """Clear a fault; connect again if the connection is gone.
+        """Clear a fault; connect again if the connection is gone. A person's wish is no fault.
 
         Raises:
             BackendError: If that does not succeed, or it was one fault in a row too many.
         """
         try:
-            self.retries.failed(reason)
+            if not self.by_person:
+                self.retries.failed(reason)
+            self.by_person = False
         except NotSafe as error:
             raise BackendError(f"the session ends after {error}. The arm is at rest.") from error
         try:

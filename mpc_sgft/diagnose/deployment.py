@@ -96,7 +96,8 @@ def read_deployment(run: Path) -> Deployment:
     task_cfg = run_config(run).task.env
     with from_config("task"):
         task: AbstractTask = instantiate(task_cfg, _convert_="all")
-    paths = sorted(p for p in (run / "episodes").glob("*.mcap") if not p.name.endswith(".empty.mcap"))
+    kept = lambda p: len(p.suffixes) == 1  # noqa: E731  # neither .empty.mcap nor .rerecorded.mcap
+    paths = sorted(filter(kept, (run / "episodes").glob("*.mcap")))
     if not paths:
         raise UserError(f"--run {run}: no episodes in {run / 'episodes'}. Deploy at least one rollout first.")
     episodes, notes = [], []
