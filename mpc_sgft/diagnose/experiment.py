@@ -44,21 +44,29 @@ def next_experiment(setup: Setup, tied: Sequence[Entry]) -> str:
     outcomes: dict[str, float] = {}
     for words, change in _commands().items():
         replayer = problem.replayer.with_commands(change)
-        outcomes[words] = _separation(problem.whiten(replayer.simulate(changes, pick), pick))
+        outcomes[words] = separation(problem.whiten(replayer.simulate(changes, pick), pick))
     for body in problem.replayer.plant.bodies:
         loaded = [c + Change(edits=(_load(body, LOAD * _mass(setup, body)),)) for c in changes]
         words = f"another load: {LOAD * _mass(setup, body):.3g} kg, weighed, on {body}"
-        outcomes[words] = _separation(problem.whiten(problem.replayer.simulate(loaded, pick), pick))
+        outcomes[words] = separation(problem.whiten(problem.replayer.simulate(loaded, pick), pick))
+    return best_of(outcomes, "motions and loads", "measure a force, a current or the load itself")
+
+
+def best_of(outcomes: dict[str, float], tried: str, otherwise: str) -> str:
+    """The experiment that separates best, in words; what to do otherwise if none does clearly.
+
+    Args:
+        outcomes: Experiment in words -> difference of the closest candidates, in units of the noise.
+        tried: What the experiments are, in words.
+        otherwise: What else would tell.
+    """
     words, size = max(outcomes.items(), key=lambda item: item[1])
     if size < CLEAR:
-        return (
-            f"none of the simulated motions and loads separates them (best: {words}, {size:.1f} times the noise); "
-            "measure a force, a current or the load itself"
-        )
+        return f"none of the simulated {tried} separates them (best: {words}, {size:.1f} times the noise); {otherwise}"
     return f"{words} (simulated, the candidates then differ by {size:.1f} times the noise)"
 
 
-def _separation(r: Array) -> float:
+def separation(r: Array) -> float:
     """Root mean square difference of the closest pair, [K, W, m] -> number."""
     pairs = [(i, j) for i in range(len(r)) for j in range(i)]
     return min(float(np.sqrt(np.mean((r[i] - r[j]) ** 2))) for i, j in pairs) if pairs else 0.0

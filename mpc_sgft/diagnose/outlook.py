@@ -8,12 +8,12 @@ import numpy as np
 
 from envs.backends.sim import SimBackend
 from mpc_sgft.diagnose.chain import RESOLUTION, Chain, effects_of
+from mpc_sgft.diagnose.experiment import best_of, separation
 from mpc_sgft.diagnose.record import Array
 from mpc_sgft.diagnose.search import Entry
 
 STARTS = 4  # simulated episodes for each proposal
 TIED = 3  # candidates that are compared
-CLEAR = 3.0  # times the noise: a separation below is not worth an experiment
 
 
 def _proposals() -> dict[str, Callable[[Array], Array]]:
@@ -39,15 +39,9 @@ def next_experiment(chain: Chain, tied: Sequence[Entry]) -> str:
     for words, change in _proposals().items():
         action = change(np.resize(chain.commands.action, (len(chain.commands.action), STARTS, chain.task.action_dim)))
         seen = np.array([_observe(b, action) for b in backends]) / scale
-        pairs = [(i, j) for i in range(len(seen)) for j in range(i)]
-        outcomes[words] = min(float(np.sqrt(np.mean((seen[i] - seen[j]) ** 2))) for i, j in pairs)
-    words, size = max(outcomes.items(), key=lambda item: item[1])
-    if size < CLEAR:
-        return (
-            f"none of the simulated motions separates them (best: {words}, {size:.1f} times the noise); measure a "
-            "force, weigh the object, or put a known load on it"
-        )
-    return f"{words} (simulated, the candidates then differ by {size:.1f} times the noise)"
+        outcomes[words] = separation(seen)
+    otherwise = "measure a force, weigh the object, or put a known load on it"
+    return best_of(outcomes, "motions", otherwise)
 
 
 def _observe(backend: SimBackend, action: Array) -> Array:
