@@ -17,6 +17,7 @@ Array = NDArray[np.float64]
 BODY_JOINTS = slice(2, 7)  # joints 3 to 7: elbow and wrist, the ones that can reach the table
 TRACKING = 0.35  # [rad] a joint this far from where it was told to be is doubtful
 OUTSIDE = 0.03  # [m] the measured tip may be this far outside the box, since compliance lets it be pushed
+BOW = 1e-3  # [m] that the tip leaves the straight line between two postures
 
 
 class NotSafe(Exception):
@@ -84,19 +85,28 @@ class Gate:
     def route(self, path: Array) -> Array:
         """A longer path as it is, [S, 7], if every target and every pace in it is allowed.
 
+        An arm at rest sags, so the path may begin up to `OUTSIDE` out of the box, as long as it leads straight back in.
+
         Raises:
             NotSafe: With the first reason, and where.
         """
-        self._check_start(path[:1])
         if not np.isfinite(path).all():
             raise NotSafe("a target of the path is not finite")
-        for reason, where in self._forbidden(path[None], None).items():
+        found = self._forbidden(path[None], None)
+        found["workspace box"] &= ~self._returning(path)
+        for reason, where in found.items():
             if where.any():
                 at = int(where[0].argmax())
                 raise NotSafe(f"{reason}, after {100 * at // len(path)} % of the path (tip {self.tip(path[at])} m)")
         if (np.abs(np.diff(path, axis=0)) > self.limits.speed * DQ_MAX * self.sample_dt + 1e-9).any():
             raise NotSafe("joint speed")
         return path
+
+    def _returning(self, path: Array) -> NDArray[np.bool_]:
+        """Which targets [1, S] are still on the way back in: along no axis farther out than the targets before them."""
+        tip = chain(path, self.tool_length)[2]  # [S, 3]
+        out = np.maximum(0, np.maximum(self.limits.low - tip, tip - np.array(self.limits.high)))
+        return ((out[0] <= OUTSIDE) & (out <= np.minimum.accumulate(out) + BOW)).all(1)[None]
 
     def tip(self, q: Array) -> list[float]:
         """Where the tip is for one posture [7], rounded for people, [3] m."""

@@ -1,11 +1,12 @@
 """From anywhere on the table to the start and down: inside the limits all the way, at rest at both ends."""
 
 import numpy as np
+import pytest
 import yaml
 
 from envs.backends.limits import Limits
 from envs.backends.route import reset_route
-from envs.backends.safety import Gate
+from envs.backends.safety import Gate, NotSafe
 from envs.kinematics import inverse, tip_position
 from envs.tasks.push import Push
 from mpc_sgft.choices import CONFIG_DIR
@@ -30,6 +31,29 @@ def test_every_way_to_the_start_is_allowed(robot_push: Push, robot_config: dict)
         np.testing.assert_allclose(away[-1], down[0])
         np.testing.assert_allclose(tip_position(down[:1], task.tool_length)[0], robot_config["safe_tip"], atol=2e-3)
         assert np.abs(down[1] - down[0]).max() < 1e-4 and np.abs(down[-1] - down[-2]).max() < 1e-4
+
+
+def test_an_arm_that_sagged_out_of_the_box_may_return_but_not_leave_again(robot_push: Push, robot_config: dict) -> None:
+    task, limits = robot_push, Limits(**robot_config["limits"])
+    gate = Gate(limits, tool_length=task.tool_length, sample_dt=0.008)
+    way = {"safe_tip": np.array(robot_config["safe_tip"]), "rest": task.rest, "tool_length": task.tool_length}
+    above = inverse(task.home(), np.array([[0.72, 0.2, limits.low[2] + 0.02]]), task.rest, task.tool_length)
+
+    def away(depth: float) -> np.ndarray:
+        sagged, tip = above, np.array([[0.72, 0.2, limits.low[2] - depth]])
+        for _ in range(5):
+            sagged = inverse(sagged, tip, task.rest, task.tool_length)
+        np.testing.assert_allclose(tip_position(sagged, task.tool_length), tip, atol=5e-4)
+        return reset_route(sagged[0], task.home()[0], speed=robot_config["reset_speed"], sample_dt=0.008, **way)[0]
+
+    for depth in (0.0005, 0.005, 0.025):
+        gate.route(away(depth))
+    with pytest.raises(NotSafe, match="workspace box"):
+        gate.route(away(0.035))
+    with pytest.raises(NotSafe, match="workspace box"):
+        gate.route(away(0.005)[::-1])  # the same way, outwards
+    with pytest.raises(NotSafe, match="already outside"):
+        gate.step(away(0.005)[:1], away(0.005)[:1], 25)  # an action never starts out there
 
 
 def test_the_nominal_scene_would_be_refused_on_a_robot() -> None:
