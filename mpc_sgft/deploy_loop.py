@@ -14,7 +14,7 @@ from mpc_sgft import build, checkpoint, person, robot, run_folder
 from mpc_sgft.agent import Agent
 from mpc_sgft.audit import audit, write_audit
 from mpc_sgft.drive import Rollout, begin, drive, from_episode
-from mpc_sgft.errors import Stopped, UserError
+from mpc_sgft.errors import Stopped, UserError, disk_error
 from mpc_sgft.log import GrowingTable, MetricLogger, progress
 from mpc_sgft.operator import Nobody, Operator
 from mpc_sgft.pretrain_loop import EVAL_SEED, StopRequest
@@ -46,6 +46,12 @@ def deploy(cfg: DictConfig) -> int:
             if operator.stopping:
                 raise Stopped(run.how_to_go_on()) from error
             raise UserError(f"{error} {run.how_to_go_on()}") from error
+        except OSError as error:  # closing the backend, on the way out, brings the arm to rest
+            then = f"Make room. Every whole step is on disk, {run.how_to_go_on()}"
+            message = disk_error(error, then)
+            if message is None:
+                raise
+            raise UserError(message) from error
     print(json.dumps(summary))
     return 0
 

@@ -10,10 +10,12 @@ from difflib import get_close_matches
 DISK_ERRORS = {
     errno.ENOSPC: "the disk is full",
     errno.EDQUOT: "the disk quota is used up",
+    errno.EFBIG: "files may not grow any larger here (ulimit -f)",
     errno.EACCES: "no permission",
     errno.EPERM: "no permission",
     errno.EROFS: "the file system is read-only",
 }
+ELSEWHERE = "Earlier results are untouched; choose another place with run_dir=..."
 
 
 class UserError(Exception):
@@ -66,9 +68,14 @@ def from_config(what: str) -> Iterator[None]:
         raise cause from err
 
 
-def disk_error(err: OSError) -> str | None:
-    """One line for a full disk or a missing permission; None for any other OSError."""
+def disk_error(err: OSError, then: str = ELSEWHERE) -> str | None:
+    """One line for a full disk or a missing permission; None for any other OSError.
+
+    Args:
+        err: What came.
+        then: What is safe, and what to do.
+    """
     if err.errno not in DISK_ERRORS:
         return None
     place = err.filename or "the run folder"
-    return f"{place}: {DISK_ERRORS[err.errno]}. Earlier results are untouched; choose another place with run_dir=..."
+    return f"{place}: {DISK_ERRORS[err.errno]}. {then}"

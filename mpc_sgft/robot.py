@@ -10,6 +10,7 @@ from omegaconf import DictConfig, OmegaConf
 from envs.backends.arm import Arm
 from envs.backends.base import BackendError
 from envs.backends.franka import FrankaBackend
+from envs.backends.gripper import Gripper
 from envs.backends.limits import Limits
 from envs.backends.rig import Place, Rig
 from envs.backends.safety import Gate
@@ -24,6 +25,7 @@ from mpc_sgft.operator import Nobody, Operator
 from mpc_sgft.world_model import WorldModel
 
 STAND_IN = "stand-in"
+NO_GRIPPER = {"width": None, "speed": 0.05, "force": 40.0}  # of runs from before there was the setting
 
 
 def make_env(cfg: DictConfig, place: Place | None = None) -> ControlEnv:
@@ -59,6 +61,8 @@ def make_env(cfg: DictConfig, place: Place | None = None) -> ControlEnv:
         task = instantiate({**cfg.task.env, **on_robot}, _convert_="all")
     with from_config("backend.limits"):
         limits = Limits(**settings["limits"])
+    with from_config("backend.gripper"):
+        gripper = Gripper(**settings.get("gripper", NO_GRIPPER))
     try:
         with from_config("backend.arm"):
             arm = Arm(str(ip), **settings["arm"])
@@ -77,7 +81,8 @@ def make_env(cfg: DictConfig, place: Place | None = None) -> ControlEnv:
     with from_config("backend"):
         gate = Gate(limits, tool_length=task.tool_length, sample_dt=SAMPLE_DT)
         clock = clock or ("robot" if ip == STAND_IN else "wall")
-        rig = Rig(arm, look, gate, clock=clock, patience=settings["patience"], dry_run=settings["dry_run"])
+        patience, dry_run = settings["patience"], settings["dry_run"]
+        rig = Rig(arm, look, gate, gripper=gripper, clock=clock, patience=patience, dry_run=dry_run)
         backend = FrankaBackend(task, rig, safe_tip=settings["safe_tip"], reset_speed=settings["reset_speed"])
     return ControlEnv(backend, history=cfg.task.history)
 

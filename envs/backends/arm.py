@@ -1,10 +1,7 @@
 """The FR3 through franky: connect, read, aim an impedance tracker, stop. No task and no limits in here."""
 
-import socket
-import threading
 import time
 from collections.abc import Callable
-from types import ModuleType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,10 +9,10 @@ from numpy.typing import NDArray
 
 from envs.backends.arm_errors import explain, first_line, not_ready
 from envs.backends.base import BackendError
+from envs.backends.client import knock, load_franky, within
 
 Array = NDArray[np.float64]
 FCI_PORT = 1337
-INSTALL = "pip install 'mpc_sgft[franka]'"
 
 
 class ArmState(NamedTuple):
@@ -27,19 +24,6 @@ class ArmState(NamedTuple):
     time: float
     mode: str
     errors: str
-
-
-def load_franky() -> ModuleType:
-    """The client library.
-
-    Raises:
-        BackendError: With the command that installs it.
-    """
-    try:
-        import franky
-    except ImportError as error:
-        raise BackendError(f"--backend franka needs the robot's client ({error}). Install it: {INSTALL}") from error
-    return franky
 
 
 class Arm:
@@ -95,14 +79,14 @@ class Arm:
             BackendError: Why not, and what to check.
         """
         try:
-            socket.create_connection((self.ip, FCI_PORT), timeout=3.0).close()
+            knock(self.ip, FCI_PORT)
         except OSError as error:
             raise BackendError(
                 f"no robot answers at {self.ip} ({error}). Check --robot-ip, the cable, and in Desk that the "
                 "joints are unlocked and FCI is active."
             ) from error
         mode = self.franky.RealtimeConfig.Enforce if self.realtime == "enforce" else self.franky.RealtimeConfig.Ignore
-        found = self._within(lambda: self.franky.Robot(self.ip, realtime_config=mode))
+        found = within(self.timeout, lambda: self.franky.Robot(self.ip, realtime_config=mode), "robot", self.ip)
         self.robot = found
         self._call(lambda: found.set_collision_behavior(*self.thresholds))
         mass, centre = self.load
@@ -192,28 +176,6 @@ class Arm:
         if self.robot is not None:
             self.stop()
             self.robot = None
-
-    def _within(self, make: Callable[[], Any]) -> Any:
-        """Result of a call that might never return, such as connecting to a robot that serves somebody else."""
-        box: list[Any] = []
-
-        def run() -> None:
-            try:
-                box.append(make())
-            except Exception as error:
-                box.append(error)
-
-        thread = threading.Thread(target=run, daemon=True)
-        thread.start()
-        thread.join(self.timeout)
-        if not box:
-            raise BackendError(
-                f"the robot at {self.ip} took the connection and then said nothing for {self.timeout:.0f} s. "
-                "Another client may hold it: end that one, then try again."
-            )
-        if isinstance(box[0], Exception):
-            raise BackendError(explain(box[0], self.ip)) from box[0]
-        return box[0]
 
     def _call(self, do: Callable[[], Any]) -> Any:
         try:

@@ -8,8 +8,8 @@ TODO = {
 }
 
 
-def explain(error: Exception, ip: str) -> str:
-    """One line about an error of franky, for the robot at an address."""
+def explain(error: Exception, ip: str, what: str = "robot") -> str:
+    """One line about an error of franky, for the robot, or its gripper, at an address."""
     kind, text = type(error).__name__, first_line(error)
     if kind == "IncompatibleVersionException":
         return (
@@ -19,7 +19,7 @@ def explain(error: Exception, ip: str) -> str:
     if kind == "RealtimeException":
         return f"{text}. backend.arm.realtime=ignore runs without a real-time kernel."
     if kind == "NetworkException" or "Net Exception" in text:
-        return f"the connection to the robot at {ip} was lost ({text})"
+        return f"the connection to the {what} at {ip} was lost ({text})"
     if "safety function" in text:
         return f"{not_ready('UserStopped')} ({text})"
     return text

@@ -187,7 +187,7 @@ class FrankaBackend:
     def status(self) -> dict[str, str]:
         """What a person wants to see of the robot now, in words; asks nothing of it, so any thread may call."""
         running, seen = self.rig.running, self.rig.seen
-        found = {"robot": "at rest", "tip": "-", "object": "not seen yet"}
+        found = {"robot": "at rest", "tip": "-", "gripper": self.rig.gripper.words, "object": "not seen yet"}
         if running is not None:
             state = running.state
             stopped = f", stopped: {running.doubt}" if running.doubt else ""

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from envs.backends.arm import Arm, ArmState
 from envs.backends.base import BackendError
 from envs.backends.clock import make_clock
+from envs.backends.gripper import Gripper
 from envs.backends.safety import Gate, NotSafe, Retries, doubt, unseen
 from envs.backends.stream import Stream
 from envs.kinematics import tip_position
@@ -29,6 +30,7 @@ class Rig:
         look: Opens what sees the object, when the robot is connected; with it what puts the object somewhere, [3] m in
             the base frame, or asks somebody to (None leaves the object where it is).
         gate: What may be sent.
+        gripper: What holds the tool, not yet connected.
         clock: "wall", or "robot" to count periods on the robot's clock: for a stand-in that cannot keep up with time.
         patience: How long the arm holds and waits for a lost object before it stops, [s].
         dry_run: Everything but moving: nothing is streamed, nobody is asked to place anything.
@@ -40,11 +42,13 @@ class Rig:
         look: Callable[[], tuple[Perception, Place | None]],
         gate: Gate,
         *,
+        gripper: Gripper,
         clock: str,
         patience: float,
         dry_run: bool,
     ):
         self.arm, self.gate, self.patience, self.dry_run = arm, gate, patience, dry_run
+        self.gripper = gripper
         self.clock = make_clock(clock, arm)
         self.retries = Retries(gate.limits.retries)
         self.running: Stream | None = None
@@ -59,7 +63,7 @@ class Rig:
         self.seen: Detection | None = None  # last sight that was used
 
     def open(self) -> None:
-        """Connect, and stand ready.
+        """Connect if need be, hold the tool, and stand ready.
 
         Raises:
             BackendError: Why not, and what to check.
@@ -70,6 +74,7 @@ class Rig:
             self.arm.connect()
             if not self.dry_run:
                 self.arm.recover()
+        self.gripper.hold(self.arm.ip, moves=not self.dry_run)
 
     @property
     def stream(self) -> Stream:
@@ -182,12 +187,14 @@ class Rig:
             self.arm.recover()
         except BackendError:
             self.arm.close()
+            self.gripper.close()
             self.open()
 
     def close(self) -> None:
         """Stop the arm and disconnect."""
         self.end()
         self.arm.close()
+        self.gripper.close()
         if self._perception is not None:
             self._perception.close()
             self._perception = None

@@ -1,8 +1,10 @@
 """What a user can get wrong with --backend franka: one line each, before anything is started."""
 
+from pathlib import Path
+
 import pytest
 
-from mpc_sgft import compose, robot
+from mpc_sgft import build, checkpoint, compose, deploy, robot
 from mpc_sgft.errors import UserError
 
 
@@ -23,6 +25,7 @@ def config(*given: str):
         (("robot-ip=stand-in", "gap=turned"), "a gap is what a simulator lacks"),
         (("robot-ip=stand-in", "backend.limits.low=[0.9,-0.3,-0.2]"), "inside out along x"),
         (("robot-ip=stand-in", "backend.limits.joint_margin=9"), "joint_margin"),
+        (("robot-ip=stand-in", "backend.gripper.width=-0.02"), "backend.gripper: width=-0.02; above 0"),
     ],
 )
 def test_one_line_for_each_mistake(given: tuple[str, ...], words: str) -> None:
@@ -51,3 +54,16 @@ def test_the_missing_client_is_named_with_its_command(monkeypatch: pytest.Monkey
     monkeypatch.setitem(__import__("sys").modules, "franky", None)
     with pytest.raises(UserError, match=r"pip install 'mpc_sgft\[franka\]'"):
         robot.make_env(config("robot-ip=stand-in"))
+
+
+def test_a_checkpoint_of_another_task_is_refused_before_anything_connects(tmp_path: Path, capsys) -> None:
+    """Nobody is at the address: an attempt to connect would say so instead."""
+    whole = checkpoint.load(build.shipped("push"))
+    other = tmp_path / "pendulum.safetensors"
+    checkpoint.save(other, whole.model, {**whole.meta, "task": "pendulum"})
+    args = ["--backend", "franka", "--robot-ip", "127.77.77.77", "perception=fixed", "--checkpoint", str(other)]
+    assert deploy.main([*args, f"run_dir={tmp_path / 'run'}"]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: ") and error.count("\n") == 1, error
+    assert "expected task='push', found task='pendulum'" in error and str(other) in error
+    assert not (tmp_path / "run").exists()

@@ -12,6 +12,7 @@ import yaml
 
 from envs.backends.arm import Arm
 from envs.backends.franka import FrankaBackend
+from envs.backends.gripper import Gripper
 from envs.backends.limits import Limits
 from envs.backends.rig import Rig
 from envs.backends.safety import Gate
@@ -49,15 +50,16 @@ def stand_in(robot_push: Push) -> Iterator[StandIn]:
 
 @pytest.fixture
 def on_stand_in(robot_push: Push, robot_config: dict) -> Iterator[Callable[..., FrankaBackend]]:
-    """on_stand_in(stand_in, **limits): a backend that is reset; the test's end closes it."""
+    """on_stand_in(stand_in, width, **limits): a backend that is reset, the gripper holding a tool."""
     made = []
 
-    def make(stand_in: StandIn, **changes: float) -> FrankaBackend:
+    def make(stand_in: StandIn, width: float | None = None, **changes: float) -> FrankaBackend:
         limits = Limits(**{**robot_config["limits"], **SLOW, **changes})
         gate = Gate(limits, tool_length=robot_push.tool_length, sample_dt=SAMPLE_DT)
         arm = Arm(stand_in.ip, **{**robot_config["arm"], "timeout": 30})
         look = lambda: (stand_in, stand_in.scene.place)  # noqa: E731
-        rig = Rig(arm, look, gate, clock="robot", patience=1.0, dry_run=False)
+        gripper = Gripper(**{**robot_config["gripper"], "width": width})
+        rig = Rig(arm, look, gate, gripper=gripper, clock="robot", patience=1.0, dry_run=False)
         backend = FrankaBackend(robot_push, rig, safe_tip=robot_config["safe_tip"], reset_speed=0.4)
         backend.pace.measure = rig.clock.now
         made.append(backend)

@@ -2,6 +2,7 @@
 
 import ctypes
 import re
+import resource
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -107,6 +108,27 @@ def test_a_planner_that_returns_nan_never_reaches_the_arm(robot: FrankaBackend, 
     held = robot.rig.stream.told.copy()
     time.sleep(0.1)
     assert np.isfinite(held).all() and np.array_equal(robot.rig.stream.told, held)
+
+
+def test_a_full_disk_in_mid_episode_leaves_the_arm_at_rest(robot: FrankaBackend, episode, tmp_path: Path) -> None:
+    """No file may grow any further, which is what a full disk is to the writer."""
+    limit = resource.getrlimit(resource.RLIMIT_FSIZE)
+    path = tmp_path / "1.mcap"
+    try:
+        full = lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (path.stat().st_size, limit[1]))  # noqa: E731
+        _, recording = episode(full, expected=OSError)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limit)
+    assert list(recording.transitions["step"]) == list(range(AT)) and not recording.complete
+    assert len(recording.joints["time"]) >= 20 * AT
+    stream = robot.rig.stream
+    deadline = time.monotonic() + 5
+    while stream.playing and time.monotonic() < deadline:  # the last few milliseconds of the step that was lost
+        time.sleep(0.001)
+    assert not stream.playing and not stream.stopped.is_set()  # it holds
+    assert robot.rig.end() == ""  # as closing the backend does on the command's way out
+    state = robot.rig.arm.read()
+    assert state.mode == "Idle" and abs(state.dq).max() < 0.01  # [rad/s]
 
 
 def test_a_process_that_stalls_holds_and_goes_on(robot: FrankaBackend, episode) -> None:
