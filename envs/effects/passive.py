@@ -75,8 +75,9 @@ def stiff_dry_friction(joint: mujoco.MjsJoint, level: float) -> None:
 
 
 def stiffen_dry_friction(joint: mujoco.MjsJoint) -> None:
+    """As dry as the time step allows: MuJoCo raises a solref below two steps to two steps."""
     joint.solimp_friction[:3] = [0.99, 0.9999, 0.001]
-    joint.solref_friction[:2] = [0.002, 1.0]
+    joint.solref_friction[:2] = [1e-4, 1.0]
 
 
 def effective_inertia(spec: mujoco.MjSpec, joints: list[mujoco.MjsJoint]) -> list[float]:

@@ -110,11 +110,21 @@ def _even(
     joints: Sequence[str],
     notes: tuple[str, ...],
 ) -> Episode:
-    """One piece on an even clock: positions by cubic interpolation, commands as they were held."""
+    """One piece on an even clock: positions by cubic interpolation.
+
+    Stamps that scatter around an even clock by less than half a sample are taken for scattered readings of a controller
+    that ticks evenly: the command of a row acts from its tick on. Otherwise commands act from the row's own time on.
+    """
     time = columns["time"][rows]
-    even = time[0] + dt * np.arange(int((time[-1] - time[0]) / dt + 1e-6) + 1)
+    ticks = np.concatenate([[0], np.cumsum(np.maximum(1, np.round(np.diff(time) / dt)))])
+    even_dt, first = _line(ticks, time)
+    if np.abs(time - first - even_dt * ticks).max() < 0.5 * even_dt:
+        even, late = first + even_dt * np.arange(int(ticks[-1]) + 1), even_dt / 2
+    else:
+        even_dt, late = dt, 1e-9
+        even = time[0] + dt * np.arange(int((time[-1] - time[0]) / dt + 1e-6) + 1)
     jitter = len(even) != len(time) or bool(np.abs(time - even).max() > JITTER * dt)
-    held = np.clip(np.searchsorted(time, even + 1e-9, side="right") - 1, 0, len(time) - 1)
+    held = np.clip(np.searchsorted(time, even + late, side="right") - 1, 0, len(time) - 1)
 
     def smooth(values: Array) -> Array:
         return CubicSpline(time, values)(even) if jitter else values
@@ -122,4 +132,13 @@ def _even(
     ctrl = np.stack([columns[f"ctrl/{a}"][rows][held] for a in actuators], 1) if actuators else np.zeros((len(even), 0))
     wanted = [n for n in columns if n.split("/")[0] in KINDS]
     wanted = [n for n in wanted if not n.startswith("qpos/") or n.split("/", 1)[1] in joints]
-    return Episode(name, dt, ctrl, {n: smooth(columns[n][rows]) for n in wanted}, notes)
+    return Episode(name, even_dt, ctrl, {n: smooth(columns[n][rows]) for n in wanted}, notes, jitter)
+
+
+def _line(x: Array, y: Array) -> tuple[float, float]:
+    """Slope and value at 0 of the line with the least absolute distance, by reweighted least squares."""
+    weights = np.ones(len(x))
+    for _ in range(20):
+        slope, start = np.polyfit(x, y, 1, w=np.sqrt(weights))
+        weights = 1 / np.maximum(np.abs(y - start - slope * x), 1e-9)
+    return float(slope), float(start)

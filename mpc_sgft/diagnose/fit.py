@@ -1,4 +1,9 @@
-"""Simulation error as least squares: whitened residuals, errors of the start projected out, bounded Gauss-Newton."""
+"""Simulation error, robust over windows: whitened residuals, errors of the start projected out, bounded Gauss-Newton.
+
+What is minimised is the mean over windows of log(1 + e / s), e a window's mean square residual and s some times the
+windows' median of it: a window that a structure cannot explain does not outvote those that it can. Its Gauss-Newton
+steps are those of least squares with weights 1 / (1 + e / s).
+"""
 
 from __future__ import annotations
 
@@ -16,7 +21,8 @@ MAX_POINTS = 40  # residuals per window and signal; more samples are averaged
 STEP = 1e-2  # finite differences, in typical sizes of a parameter
 TOLERANCE = 1e-3  # relative gain of an iteration that is too small to go on
 ITERATIONS = 12
-PRIOR = 1e3  # weight of a parameter's prior, in typical sizes: a floor that keeps unseen parameters in place
+OUTLYING = 4.0  # times the median error, or noise
+MOST_FLOOR = 10.0  # times the noise: the simulator's own error weighs a point down by no more
 
 
 class Fit(NamedTuple):
@@ -35,8 +41,24 @@ class Fit(NamedTuple):
     J: Array
 
     @property
-    def cost(self) -> float:
-        return float(np.mean(self.r**2))
+    def weights(self) -> Array:
+        """Of the fitted windows, [W]."""
+        return weights(self.r)
+
+
+def typical(r: Array) -> float:
+    """The error beyond which a window of residuals [W, m] loses weight."""
+    return OUTLYING * max(1.0, float(np.median((r**2).mean(-1))))
+
+
+def weights(r: Array) -> Array:
+    """Of windows with residuals [W, m], [W]."""
+    return 1 / (1 + (r**2).mean(-1) / typical(r))
+
+
+def robust(r: Array, scale: float) -> Array:
+    """What a fit minimises, of residuals [..., W, m], [...]."""
+    return np.log1p((r**2).mean(-1) / scale).mean(-1)
 
 
 def change_of(terms: Sequence[Term], values: Sequence[Array]) -> Change:
@@ -63,18 +85,23 @@ class Problem:
     Args:
         replayer: Simulates.
         sigma: Noise of each signal, one sample, [S].
-        floor: Error of the simulator itself, per signal, [S].
+        floor: Error of the simulator itself, with its sign, terms [F, W, n, S] that add up in squares.
         start_sd: Uncertainty of each window's start, [W, 2 nj]; projected out.
         sensitivity: Derivative of the predictions by the start, [W, n, S, 2 nj].
+
+    Attributes:
+        floor_share: Of each window's expected error, how much is the simulator's, 0…1, [W].
     """
 
     def __init__(self, replayer: Replayer, sigma: Array, floor: Array, start_sd: Array, sensitivity: Array):
-        self.replayer, self.sigma, self.floor = replayer, sigma, floor
+        self.replayer, self.sigma = replayer, sigma
         n = replayer.windows.samples
         self.stride = max(1, n // MAX_POINTS)
         self.blocks = n // self.stride
-        self.scale = np.sqrt(sigma**2 / self.stride + floor**2)  # [S]
         self.target = self._average(replayer.windows.measured)
+        noise = sigma / np.sqrt(self.stride)
+        self.scale = np.sqrt(noise**2 + np.minimum((self._average(floor) ** 2).sum(0), (MOST_FLOOR * noise) ** 2))
+        self.floor_share = (1 - (noise / self.scale) ** 2).mean((1, 2))
         moved = self._average(np.moveaxis(sensitivity, -1, 0)) / self.scale  # [2 nj, W, nb, S]
         a = moved.reshape(*moved.shape[:2], -1).transpose(1, 2, 0) * start_sd[:, None]  # [W, m, 2 nj]
         self.u, s, _ = np.linalg.svd(a, full_matrices=False)
@@ -82,7 +109,7 @@ class Problem:
 
     def whiten(self, predicted: Array, pick: Index) -> Array:
         """Predictions [K, W, n, S] -> residuals [K, W, m] of unit variance where the model is right."""
-        y = (self._average(predicted) - self.target[pick]) / self.scale
+        y = (self._average(predicted) - self.target[pick]) / self.scale[pick]
         y = y.reshape(*y.shape[:2], -1)
         u = self.u[pick]
         return y - np.einsum("wmi,kwi->kwm", u, np.einsum("wmi,kwm->kwi", u, y) * self.shrink[pick])
@@ -116,11 +143,13 @@ def fit(
         return Fit(tuple(terms), tuple(start), r, np.zeros((*r.shape, 0)))
     for _ in range(iterations):
         r, J = _linearise(problem, flat, x, pick)
-        A, g = np.einsum("wmp,wmq->pq", J, J), np.einsum("wmp,wm->p", J, r)
+        w = weights(r)
+        A, g = np.einsum("w,wmp,wmq->pq", w, J, J, optimize=True), np.einsum("w,wmp,wm->p", w, J, r, optimize=True)
         tries = [flat.clip(x + _step(A, g, lam, x, flat)) for lam in (damping / 10, damping, damping * 30)]
-        costs = (problem.residuals(terms, [flat.unpack(t) for t in tries], pick) ** 2).mean((1, 2))
+        scale = typical(r)
+        costs = robust(problem.residuals(terms, [flat.unpack(t) for t in tries], pick), scale)
         best = int(np.argmin(costs))
-        before = float(np.mean(r**2))
+        before = float(robust(r, scale))
         damping = min(max(damping * (0.1, 1.0, 30.0)[best], 1e-8), 1e8)
         if costs[best] >= before:
             damping *= 10
@@ -197,12 +226,13 @@ def left_out_errors(f: Fit, blocks: Index) -> Array:
     count = f.J.shape[-1]
     if not count:
         return (f.r**2).mean(1)
-    per = np.einsum("wmp,wmq->wpq", f.J, f.J)
+    weight = f.weights
+    per = np.einsum("w,wmp,wmq->wpq", weight, f.J, f.J, optimize=True)
     total, out = per.sum(0), np.empty(len(f.r))
     ridge = 1e-9 * np.eye(count) * max(float(np.trace(total)) / count, 1e-30)
     for b in np.unique(blocks):
         mine = blocks == b
         rest = total - per[mine].sum(0) + ridge
-        moved = np.linalg.solve(rest, np.einsum("wmp,wm->p", f.J[mine], f.r[mine]))
+        moved = np.linalg.solve(rest, np.einsum("w,wmp,wm->p", weight[mine], f.J[mine], f.r[mine], optimize=True))
         out[mine] = ((f.r[mine] + f.J[mine] @ moved) ** 2).mean(1)
     return out

@@ -25,7 +25,7 @@ class Flexible(NamedTuple):
     """A fitted residual model.
 
     Attributes:
-        errors: Of every window when its block is left out, [W fitted + W held].
+        errors: Of every window when its block is left out, as sets are judged, [W fitted + W held].
         weights: Of the features, in PUSH times the typical force of their joint.
         ridge: Regularisation that left-out blocks prefer.
     """
@@ -61,14 +61,15 @@ def flexible_fit(setup: Setup, best: Entry, scales: dict[str, Scales], rng: np.r
     free = np.r_[np.ones(J_all.shape[-1]), np.full(own.shape[-1], 1e-6)]
     norm = np.sqrt((X[fitted] ** 2).mean((0, 1))) + 1e-12
     X = X / norm
-    choices = [
-        (_left_out(X[fitted], r0[fitted], setup.blocks, lam * free * len(fitted) * r0.shape[1]), lam) for lam in RIDGES
-    ]
-    errors, lam = min(choices, key=lambda c: float(c[0].mean()))
-    w = _solve(X[fitted], r0[fitted], lam * free * len(fitted) * r0.shape[1])
+    weight = best.fit.weights[:, None, None]  # as the named effects were fitted
+    Xw, rw = X[fitted] * np.sqrt(weight), r0[fitted] * np.sqrt(weight[..., 0])
+    free = free * len(fitted) * r0.shape[1]
+    choices = [(_left_out(Xw, rw, setup.blocks, lam * free) / weight[:, 0, 0], lam) for lam in RIDGES]
+    errors, lam = min(choices, key=lambda c: float(np.log1p(c[0]).mean()))
+    w = _solve(Xw, rw, lam * free)
     held = X[len(fitted) :, :, : J_all.shape[-1]] @ w[: J_all.shape[-1]]
     held_errors = ((r0[len(fitted) :] + held) ** 2).mean(1)
-    return Flexible(np.concatenate([errors, held_errors]), (w / norm)[: J_all.shape[-1]], lam)
+    return Flexible(setup.judged(np.concatenate([errors, held_errors])), (w / norm)[: J_all.shape[-1]], lam)
 
 
 def _features(setup: Setup, scales: dict[str, Scales], rng: np.random.Generator) -> Array:

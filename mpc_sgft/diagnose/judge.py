@@ -12,8 +12,9 @@ from mpc_sgft.diagnose.record import Array
 RESAMPLES = 1000
 GAIN_LEVEL = 0.98  # a larger structure must be better with this confidence ...
 TIE_LEVEL = 0.90  # ... while a rival of the same size must be worse with this one, or it ties
-MIN_SHARE = 0.005  # of the error: a gain below is not worth a name
-MIN_GAIN = 0.02  # in units of the noise's variance
+FEW = 12  # windows
+MIN_GAIN = 0.05  # in log(1 + e): a gain below is not worth a name ...
+MIN_SHARE = 0.05  # ... nor one below this share of the error
 
 
 class Interval(NamedTuple):
@@ -25,8 +26,8 @@ class Interval(NamedTuple):
 def gain(worse: Array, better: Array, level: float, rng: np.random.Generator) -> Interval:
     """Mean drop of the error from one structure to another with its interval (two-sided `level`).
 
-    The wider of Student's and the bootstrap's interval: the one knows that windows are few, the other that they are
-    not normal.
+    The bootstrap's, which knows that gains are not normal: an effect may show in a few windows only. Where windows are
+    few, it is widened to Student's.
 
     Args:
         worse, better: Errors of the same windows, [W].
@@ -35,16 +36,18 @@ def gain(worse: Array, better: Array, level: float, rng: np.random.Generator) ->
     mean = float(d.mean())
     if len(d) < 2 or np.ptp(d) == 0:
         return Interval(mean, mean, mean)
-    half = float(stats.t.ppf(0.5 + level / 2, len(d) - 1) * d.std(ddof=1) / np.sqrt(len(d)))
     means = d[rng.integers(0, len(d), (RESAMPLES, len(d)))].mean(1)
     low, high = np.quantile(means, [0.5 - level / 2, 0.5 + level / 2])
+    if len(d) >= FEW:
+        return Interval(mean, float(low), float(high))
+    half = float(stats.t.ppf(0.5 + level / 2, len(d) - 1) * d.std(ddof=1) / np.sqrt(len(d)))
     return Interval(mean, min(float(low), mean - half), max(float(high), mean + half))
 
 
 def credible(worse: Array, better: Array, rng: np.random.Generator, level: float = GAIN_LEVEL) -> bool:
     """Whether the gain is real, and large enough to matter."""
     g = gain(worse, better, 2 * level - 1, rng)
-    return g.low > 0 and g.mean > max(MIN_SHARE * float(worse.mean()), MIN_GAIN)
+    return g.low > 0 and g.mean > max(MIN_GAIN, MIN_SHARE * float(worse.mean()))
 
 
 def worse(rival: Array, best: Array, rng: np.random.Generator) -> bool:

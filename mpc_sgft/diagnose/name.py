@@ -11,13 +11,15 @@ from scipy import stats
 from mpc_sgft.diagnose import judge
 from mpc_sgft.diagnose.fit import fit
 from mpc_sgft.diagnose.flexible import Flexible
-from mpc_sgft.diagnose.prepare import Setup
+from mpc_sgft.diagnose.prepare import NOISE, Setup
 from mpc_sgft.diagnose.record import Array
 from mpc_sgft.diagnose.search import Entry, entry
 from mpc_sgft.diagnose.table import EQUIVALENT, Equivalence
 
 UNEXPLAINED = 0.05  # share of what any model can explain that named effects may miss before the answer is "unknown"
-ABOVE_NOISE = 1.3  # an error below this many times the noise's variance needs no further name
+ABOVE_NOISE = 0.25  # in log(1 + e): an error that is no more above the noise's needs no further name
+WIDER = 1.3  # of intervals: what windows that begin at each other's ends share; set on development seeds
+EXPLAINED = 0.75  # share of the error above noise that names must explain
 
 
 class Verdict(NamedTuple):
@@ -47,7 +49,7 @@ def choose(setup: Setup[Any], entries: list[Entry], rng: np.random.Generator) ->
         if not better:
             return prune(setup, current, entries, rng)
         smallest = min(e.complexity for e in better)
-        current = min((e for e in better if e.complexity == smallest), key=lambda e: e.error)
+        current = min((e for e in better if e.complexity == smallest), key=lambda e: e.error + judge.MIN_GAIN * e.idle)
 
 
 def prune(setup: Setup[Any], best: Entry, entries: list[Entry], rng: np.random.Generator) -> Entry:
@@ -93,11 +95,16 @@ def judge_entries(
         reason = f"a flexible residual model explains {missed:.0%} more of the error than {_list(best)}"
         ties = [(e, "" if q is None else q.reason) for e, q in declared]
         return Verdict("unknown", best, ties, probability, reason)
+    times = np.sqrt(np.expm1(best.error))
     if not best.effects:
         reason = "the nominal model's error is within noise and the simulator's floor"
-        if base.error > ABOVE_NOISE:
-            reason = f"no effect gains credibly; the error is {np.sqrt(base.error):.1f} times noise and floor"
+        if base.error > NOISE + ABOVE_NOISE:
+            reason = f"nothing explains the rest, {times:.1f} times noise and floor, on windows that were not fitted"
         return Verdict("none", best, [], probability, reason)
+    left = np.expm1(best.error) - 1.0
+    if best.error > NOISE + ABOVE_NOISE and left > (1 - EXPLAINED) * (np.expm1(base.error) - 1.0):
+        reason = f"{_list(best)} leaves {times:.1f} times noise and floor, which no name in the library explains"
+        return Verdict("unknown", best, [(e, "" if q is None else q.reason) for e, q in declared], probability, reason)
     best, open_ties = canonical(best, declared)
     named = [(e, "" if q is None else q.reason) for e, q in declared if e is not best]
     if open_ties:
@@ -136,7 +143,7 @@ def canonical(best: Entry, ties: list[tuple[Entry, Equivalence | None]]) -> tupl
 
 def beats(flexible: Flexible, best: Entry, base: Entry, rng: np.random.Generator) -> bool:
     """Whether something that no name in the library covers is clearly there."""
-    if best.error < ABOVE_NOISE or not judge.credible(best.errors, flexible.errors, rng):
+    if best.error < NOISE + ABOVE_NOISE or not judge.credible(best.errors, flexible.errors, rng):
         return False
     return best.error - flexible.error > UNEXPLAINED * (base.error - flexible.error)
 
@@ -150,12 +157,13 @@ def intervals(f_entry: Entry, level: float = 0.90) -> list[tuple[Array, Array]]:
     count = f.J.shape[-1]
     if not count:
         return []
-    A = np.einsum("wmp,wmq->pq", f.J, f.J)
+    weight = f.weights
+    A = np.einsum("w,wmp,wmq->pq", weight, f.J, f.J, optimize=True)
     inverse = np.linalg.pinv(A + 1e-12 * np.eye(count) * max(float(np.trace(A)), 1e-30))
-    white = np.diag(inverse) * max(1.0, f.cost)
-    scores = np.einsum("wmp,wm->wp", f.J, f.r)
+    white = np.diag(inverse) * max(1.0, float(weight @ (f.r**2).mean(1) / weight.sum()))
+    scores = np.einsum("w,wmp,wm->wp", weight, f.J, f.r, optimize=True)
     windows = np.diag(inverse @ (scores.T @ scores) @ inverse)
-    sd = np.sqrt(np.maximum(white, windows)) * float(stats.t.ppf(0.5 + level / 2, max(len(f.r) - 1, 1)))
+    sd = WIDER * np.sqrt(np.maximum(white, windows)) * float(stats.t.ppf(0.5 + level / 2, max(len(f.r) - 1, 1)))
     out, at = [], 0
     for term, value in zip(f.terms, f.values, strict=True):
         half = sd[at : at + len(value)] * term.size

@@ -21,6 +21,7 @@ from mpc_sgft.errors import UserError
 WINDOW = 0.5  # [s] where the data allow it
 MIN_WINDOWS = 16  # shorter windows rather than fewer
 BLOCKS = 8  # into which the fitted windows are split for leaving out
+NOISE = float(np.log(2.0))  # log(1 + e) of a window whose error is noise alone, e = 1
 KICK = 1e-4  # of the typical size, to differentiate by the start
 
 
@@ -36,7 +37,8 @@ class Setup(Generic[P]):
         fitted, held: Windows to fit to, and windows never fitted.
         blocks: Contiguous block of each fitted window.
         baseline: The nominal model with uncertain quantities refitted.
-        noise, floor: Of each signal, of the sensor and of the simulator, [S].
+        noise, floor: Of each signal, of the sensor and of the simulator (its median), [S].
+        quiet: An error below which nothing is left to explain.
         judged: What of a window's error counts when sets are compared; the error itself by default.
     """
 
@@ -48,6 +50,7 @@ class Setup(Generic[P]):
     noise: Array
     floor: Array
     judged: Callable[[Array], Array] = field(default=np.asarray)
+    quiet: float = -np.inf
 
 
 def default_window(episodes: Sequence[Episode]) -> float:
@@ -81,13 +84,17 @@ def prepare(
         raise UserError(f"only {len(replayer.windows.start)} windows: give more data or a shorter --window.")
     fitted, held = split(replayer, held_out)
     noise = np.array([np.median([noise_of(e.signals[s]) for e in episodes]) for s in chosen])
-    first = _problem(replayer, noise, np.zeros(len(chosen)), [], [])
+    first = _problem(replayer, noise, np.zeros((0, *replayer.windows.measured.shape)), [], [])
     base = fit(first, nominal, [t.neutral for t in nominal], fitted)
+    missed = replayer.windows.measured - replayer.simulate([change_of(nominal, base.values)])[0]
+    noise = np.minimum(noise, [np.median([noise_of(x) for x in missed[..., i]]) for i in range(len(chosen))])
     floor = simulator_floor(plant, episodes, replayer, nominal, base.values)
     problem = _problem(replayer, noise, floor, nominal, base.values)
     base = fit(problem, nominal, base.values, fitted)
     blocks = np.minimum(np.arange(len(fitted)) * BLOCKS // len(fitted), BLOCKS - 1)
-    return Setup(problem, fitted, held, blocks, base, noise, floor)
+    least = problem.floor_share[np.concatenate([fitted, held])]  # below this, an error says nothing about the machine
+    judged = lambda errors: np.log1p(np.maximum(errors, least))  # noqa: E731, two lines are shorter than a function
+    return Setup(problem, fitted, held, blocks, base, noise, np.median(floor[0], (0, 1)), judged, NOISE)
 
 
 def split(replayer: Any, held_out: float | Sequence[str] | None) -> tuple[Index, Index]:
@@ -126,14 +133,27 @@ def split(replayer: Any, held_out: float | Sequence[str] | None) -> tuple[Index,
 def simulator_floor(
     plant: Plant, episodes: Sequence[Episode], replayer: Replayer, terms: Sequence[Term], values: Sequence[Array]
 ) -> Array:
-    """Root mean square of what half the time step changes, a third more for what is left below that, [S]."""
+    """How far a prediction may be off although the model is right, at every sample of every window, [2, W, n, S].
+
+    By the simulator's time step: half of it changes the prediction by three quarters of a second-order error, or half
+    of a first-order one, which dry friction makes where a motion reverses; what is off once in a window is taken to
+    stay off. By the clock: a force follows its command at once, and may have been read before or after that changed;
+    always the one, or, where stamps scattered, now the one and now the other.
+    """
     spec = plant.spec.copy()
     spec.option.timestep = plant.model.opt.timestep / 2
     w = replayer.windows
     finer = Replayer(Plant(spec), episodes, w.samples * replayer.dt, replayer.signals)
     change = change_of(terms, values)
-    difference = finer.simulate([change])[0] - replayer.simulate([change])[0]
-    return np.sqrt(np.median((difference**2).mean(1), 0)) * 4 / 3
+    predicted = replayer.simulate([change])[0]
+    step = np.maximum.accumulate(np.abs(finer.simulate([change])[0] - predicted), 1) * 2
+    clock = np.zeros_like(step)
+    loose = np.array([episodes[i].scattered for i in w.episode])
+    for i in (i for i, name in enumerate(replayer.signals) if name.startswith("force/")):
+        clock[..., i] = np.gradient(predicted[..., i], axis=1)
+        jumps = np.abs(np.diff(predicted[loose, :, i], axis=1))
+        clock[loose, :, i] = np.pad(jumps, ((0, 0), (1, 0))) + np.pad(jumps, ((0, 0), (0, 1)))
+    return np.stack([step, clock])
 
 
 def _problem(replayer: Replayer, noise: Array, floor: Array, terms: Sequence[Term], values: Sequence[Array]) -> Problem:

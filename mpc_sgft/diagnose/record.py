@@ -43,6 +43,7 @@ class Episode:
         ctrl: Commands in the model's order, [T, nu].
         signals: `qpos/…`, `qvel/…`, `force/…`, `sensor/…` -> [T].
         notes: What was noticed while reading, in words.
+        scattered: Whether the stamps scattered around that clock.
     """
 
     name: str
@@ -50,6 +51,7 @@ class Episode:
     ctrl: Array
     signals: dict[str, Array]
     notes: tuple[str, ...] = field(default=())
+    scattered: bool = False
 
     @property
     def seconds(self) -> float:

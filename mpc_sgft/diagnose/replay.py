@@ -112,7 +112,7 @@ class Replayer:
     @property
     def steps(self) -> int:
         """Physics steps in a window."""
-        return int(np.ceil(self.windows.samples * self.dt / self.h - 1e-6)) + 1
+        return int(np.ceil(self.windows.samples * self.dt / self.h - 1e-6)) + 2
 
     def step_times(self) -> Array:
         """Time of each physics step of each window since its episode's start [s], [W, N]."""
@@ -129,6 +129,12 @@ class Replayer:
         state = np.tile(initial, (len(models), count, 1))
         q = np.tile(w.q0[pick], (len(models), 1, 1))
         v = np.tile(w.v0[pick] - self.half * w.a0[pick], (len(models), 1, 1))
+        a = np.zeros_like(q)  # before the start, for readings that are older
+        for k, change in enumerate(changes):
+            for joint, late in change.late.items():
+                i = self.plant.joints.index(joint)
+                q[k, :, i], v[k, :, i], a[k, :, i] = self._start(i, late, pick)
+                v[k, :, i] -= self.half * a[k, :, i]
         for k, change in enumerate(changes if any(c.reads for c in changes) else []):
             for i, joint in enumerate(self.plant.joints):
                 q[k, :, i] = change.unread(q[k, :, i], f"qpos/{joint}")
@@ -160,25 +166,50 @@ class Replayer:
         shape = (len(models), count, self.steps)
         qpos = np.concatenate([state[:, :, None, 1 + qadr], states[..., 1 + qadr].reshape(*shape, nj)], 2)
         qvel = np.concatenate([state[:, :, None, 1 + m.nq + vadr], states[..., 1 + m.nq + vadr].reshape(*shape, nj)], 2)
-        out = self._read(qpos, qvel, sensed.reshape(*shape, -1), m)
+        late = np.array([[c.late.get(joint, 0.0) for joint in self.plant.joints] for c in changes])
+        out = self._read(qpos, qvel, sensed.reshape(*shape, -1), m, late, a)
         for k, change in enumerate(changes if any(c.reads for c in changes) else []):
             for i, name in enumerate(self.signals):
                 out[k, ..., i] = change.read(out[k, ..., i], name)
         return out
 
-    def _read(self, qpos: Array, qvel: Array, sensed: Array, m: mujoco.MjModel) -> Array:
-        """Signals at the samples' times from states at the steps' times, [K, W, n, S]."""
-        times = self.dt * np.arange(1, self.windows.samples + 1)
+    def _start(self, joint: int, late: float, pick: Index) -> Array:
+        """True position, velocity and acceleration of a joint at the windows' starts, [3, W], if readings are old."""
+        w, out = self.windows, np.empty((3, len(pick)))
+        for i, s in enumerate(self.smooth):
+            mine = w.episode[pick] == i
+            at = np.minimum(w.start[pick][mine] + late / self.dt, len(s.q) - 1)
+            for row, values in enumerate((s.q, s.v, s.a)):
+                out[row, mine] = np.interp(at, np.arange(len(values)), values[:, joint])
+        return out
+
+    def _read(self, qpos: Array, qvel: Array, sensed: Array, m: mujoco.MjModel, late: Array, a: Array) -> Array:
+        """Signals at the samples' times from states at the steps' times, [K, W, n, S].
+
+        Args:
+            qpos, qvel: States, [K, W, N + 1, nj].
+            sensed: Sensors, [K, W, N, …].
+            m: Model that the sensors are of.
+            late: Seconds by which readings are old, [K, nj].
+            a: Acceleration before the start, [K, W, nj].
+        """
+        times = self.dt * np.arange(1, self.windows.samples + 1)[None]
+        late = late if late.any() else late[:1]
         columns = []
         for name in self.signals:
             kind, part = name.split("/", 1)
             if kind == "qpos":
-                columns.append(_at(qpos[..., self.plant.joints.index(part)], times / self.h))
+                i = self.plant.joints.index(part)
+                then = times - late[:, i, None]
+                bend = a[:, :, i, None] * np.minimum(then, 0)[:, None] ** 2 / 2
+                columns.append(_at(qpos[..., i], then / self.h) + bend)
             elif kind == "qvel":
-                columns.append(_at(qvel[..., self.plant.joints.index(part)], (times + self.half) / self.h))
+                i = self.plant.joints.index(part)
+                columns.append(_at(qvel[..., i], (times + self.half - late[:, i, None]) / self.h))
             else:
                 sensor = m.sensor(f"{FORCE}{part}" if kind == "force" else part)
-                columns.append(_at(sensed[..., int(sensor.adr[0])], times / self.h))
+                gear = m.actuator(part).gear[0] if kind == "force" else 1.0  # from the actuator's force to its joint's
+                columns.append(gear * _at(sensed[..., int(sensor.adr[0])], (times + 2 * self.half) / self.h))
         return np.stack(columns, -1)
 
     def _ctrl(self, change: Change) -> Array:
@@ -262,13 +293,14 @@ def _alike(models: Sequence[mujoco.MjModel]) -> list[list[int]]:
 
 
 def _at(values: Array, position: NDArray[Any]) -> Array:
-    """Linear interpolation of [K, W, N] at fractional indices [n]."""
-    position = np.clip(position, 0, values.shape[2] - 1)
-    low = np.minimum(position.astype(int), values.shape[2] - 2)
-    part = position - low
-    if np.abs(part).max() < 1e-9:
-        return values[:, :, low]
-    return values[:, :, low] * (1 - part) + values[:, :, low + 1] * part
+    """Linear interpolation of [K, W, N] at fractional indices [1 or K, n]; before the first, along the first step."""
+    position = np.minimum(position, values.shape[2] - 1)
+    low = np.clip(np.floor(position).astype(int), 0, values.shape[2] - 2)
+    part = (position - low)[:, None]
+    if len(low) == 1:
+        return values[:, :, low[0]] * (1 - part) + values[:, :, low[0] + 1] * part
+    rows = np.arange(len(values))[:, None]
+    return np.moveaxis(values[rows, :, low], 2, 1) * (1 - part) + np.moveaxis(values[rows, :, low + 1], 2, 1) * part
 
 
 def _held_mean(u: Array, dt: float, edges: Array) -> Array:

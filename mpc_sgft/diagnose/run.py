@@ -24,6 +24,7 @@ from mpc_sgft.diagnose.nominal import nominal_terms, refit_table
 from mpc_sgft.diagnose.plant import Change, Plant
 from mpc_sgft.diagnose.prepare import Setup, prepare, scales
 from mpc_sgft.diagnose.record import Array, Episode, files, read_table
+from mpc_sgft.diagnose.replay import Replayer
 from mpc_sgft.diagnose.report import MAX_CANDIDATES, Report
 from mpc_sgft.diagnose.search import Entry, search
 from mpc_sgft.diagnose.table import TABLE
@@ -63,15 +64,16 @@ def run(
     if max_effects < 1:
         raise UserError(f"max_effects={max_effects}: at least one effect must be allowed.")
     began, rng = time.perf_counter(), np.random.default_rng(seed)
-    setup = prepare(plant, recorded, nominal_terms(plant, uncertain), window=window, signals=signals, held_out=held_out)
-    sizes = scales(plant, setup.problem.replayer)
+    sharp = plant.sharper()
+    setup = prepare(sharp, recorded, nominal_terms(plant, uncertain), window=window, signals=signals, held_out=held_out)
+    sizes = scales(sharp, setup.problem.replayer)
     with tqdm(total=100, desc="diagnose", disable=not progress, bar_format="{desc} {bar} {n:.0f}% {postfix}") as bar:
 
         def show(what: str, share: float) -> None:
             bar.set_postfix_str(what)
             bar.update(90 * share - bar.n)
 
-        entries = search(setup, candidates(plant, sizes, effects), max_effects, rng, show)
+        entries = search(setup, candidates(sharp, sizes, effects), max_effects, rng, show)
         best = choose_set(setup, entries, rng)
         flexible = flexible_fit(setup, best, sizes, rng)
         verdict = judge_entries(setup, entries, flexible, rng)
@@ -82,7 +84,7 @@ def run(
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
         notes += repair.write(plant, verdict.best, out)
-    report = assemble(setup, entries, verdict, notes, rng, flexible.error)
+    report = assemble(plant, setup, entries, verdict, notes, rng, flexible.error)
     report.data["seconds"] = round(time.perf_counter() - began, 2)
     if out is not None:
         report.write(out)
@@ -90,10 +92,17 @@ def run(
 
 
 def assemble(
-    setup: Setup, entries: list[Entry], verdict: Verdict, notes: list[str], rng: np.random.Generator, flexible: float
+    plant: Plant,
+    setup: Setup,
+    entries: list[Entry],
+    verdict: Verdict,
+    notes: list[str],
+    rng: np.random.Generator,
+    flexible: float,
 ) -> Report:
-    """Everything that the report says."""
-    best, replayer, base = verdict.best, setup.problem.replayer, setup.baseline
+    """Everything that the report says; errors are those of the scene in its own steps."""
+    best, base, sharp = verdict.best, setup.baseline, setup.problem.replayer
+    replayer = Replayer(plant, sharp.episodes, sharp.windows.samples * sharp.dt, sharp.signals)
     nominal, repaired = replayer.simulate([Change(), change_of(best.fit.terms, best.fit.values)])
     measured = replayer.windows.measured
     shown = verdict.kind in ("effect", "not_identifiable")
@@ -185,7 +194,7 @@ def _held_out(
     """Root mean square error of the signal that is worst in units of its noise, on windows that were never fitted."""
     held, problem = setup.held, setup.problem
     before, after = (((p - measured)[held] ** 2).mean(1) for p in (nominal, repaired))  # [W, S]
-    i = int(np.argmax(before.mean(0) / problem.scale**2))
+    i = int(np.argmax(before.mean(0) / (problem.scale[held] ** 2).mean((0, 1))))
     name = problem.replayer.signals[i]
     plant = problem.replayer.plant
     kind, part = name.split("/", 1)

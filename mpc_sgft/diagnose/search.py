@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mpc_sgft.diagnose import judge
-from mpc_sgft.diagnose.fit import STEP, Fit, fit, left_out_errors, window_errors
-from mpc_sgft.diagnose.library import Term, enrich, includes
+from mpc_sgft.diagnose.fit import STEP, Fit, fit, left_out_errors, robust, typical, weights, window_errors
+from mpc_sgft.diagnose.library import HIDDEN, Term, enrich, includes
 from mpc_sgft.diagnose.prepare import Setup
 from mpc_sgft.diagnose.record import Array, Index
 
@@ -22,14 +22,17 @@ class Effort(NamedTuple):
 
     Attributes:
         beam: Sets that are extended.
-        full: Candidates that get a full fit: alone, as a second effect, as a third.
+        full: Candidates that get a full fit: alone, as a second effect, as a third; twice as many get a quick one.
         screen: Windows to screen on.
+        quick, last: Iterations of a quick fit, and of the full one that goes on from it.
         enough: Pairs are tried although no effect alone gains, if the error is above this; never by default.
     """
 
-    beam: int = 3
-    full: tuple[int, ...] = (8, 5, 4)
-    screen: int = 24
+    beam: int = 2
+    full: tuple[int, ...] = (6, 3, 3)
+    screen: int = 10
+    quick: int = 3
+    last: int = 8
     enough: float = np.inf
 
 
@@ -63,6 +66,11 @@ class Entry(NamedTuple):
     @property
     def key(self) -> frozenset[str]:
         return frozenset(t.label + str(t.fixed) for t in self.terms)
+
+    @property
+    def idle(self) -> int:
+        """Parameters of the effects that change nothing here."""
+        return sum(len(t.size) for t in self.terms) - self.complexity
 
     @property
     def error(self) -> float:
@@ -110,12 +118,13 @@ def search(
         new: dict[frozenset[str], Entry] = {}
         for b, parent in enumerate(beam):
             report(f"{' + '.join(parent.names) or 'nominal'}", (level + b / len(beam)) / (max_effects + 1))
+            full = effort.full[min(level, len(effort.full) - 1)]
             ranked = screen(setup, parent, proposals(parent, terms, max_effects), effort.screen)
-            for proposal in ranked[: effort.full[min(level, len(effort.full) - 1)]]:
+            for proposal in sharpen(setup, ranked[: 2 * full], effort)[:full]:
                 key = frozenset(t.label + str(t.fixed) for t in proposal.terms[len(setup.baseline.terms) :])
                 if key in found or key in new:
                     continue
-                f = fit(setup.problem, proposal.terms, proposal.start, setup.fitted)
+                f = fit(setup.problem, proposal.terms, proposal.start, setup.fitted, effort.last)
                 new[key] = entry(setup, f)
         found |= new
         if not new:
@@ -124,6 +133,8 @@ def search(
         if judge.credible(best.errors, beam[0].errors, rng):
             best = beam[0]
         elif level or best.error <= effort.enough:
+            break
+        if best.error < setup.quiet:
             break
     return list(found.values())
 
@@ -145,15 +156,21 @@ def proposals(
             swapped[i] = enrich(term, base[i], values[i])
             out.append(((*base[:i], term, *base[i + 1 :]), swapped, i))
         elif parent.effects < max_effects:
-            out += [((*base, term), [*values, start], len(base)) for start in term.starts]
+            out += [((*base, term), [*values, start], len(base)) for start in spread_starts(term)]
     return out
+
+
+def spread_starts(term: Term) -> list[Array]:
+    """The starts of a term, and the same a tenth as far from no effect, from where small effects are found."""
+    some = [n not in HIDDEN for n in term.names]
+    return [np.where(some, term.neutral + share * (s - term.neutral), s) for share in (1.0, 0.1) for s in term.starts]
 
 
 def screen(
     setup: Setup[Any], parent: Entry, options: list[tuple[tuple[Term, ...], list[Array], int]], windows: int
 ) -> list[Proposal]:
     """Order proposals by their error after one Gauss-Newton step, the best start of each set only."""
-    problem, pick = setup.problem, _spread(setup.fitted, windows)
+    problem, pick, scale = setup.problem, _spread(setup.fitted, windows), typical(parent.fit.r)
     rows = np.searchsorted(setup.fitted, pick)
     best: dict[frozenset[str], Proposal] = {}
     for terms, start, new in options:
@@ -170,16 +187,27 @@ def screen(
             continue
         J_old = parent.fit.J[rows] if new == len(parent.fit.terms) else np.zeros((*r.shape[1:], 0))
         J = np.concatenate([J_old, J_new], -1)
-        A, g = np.einsum("wmp,wmq->pq", J, J), np.einsum("wmp,wm->p", J, r[0])
+        w = weights(r[0])
+        A, g = np.einsum("w,wmp,wmq->pq", w, J, J, optimize=True), np.einsum("w,wmp,wm->p", w, J, r[0], optimize=True)
         A = A + np.diag(1e-3 * np.diag(A) + 1e-9 * max(float(np.diag(A).max()), 1e-30))
         step = -np.linalg.solve(A, g)
         tries = [_moved(terms, start, new, step * share, J_old.shape[-1]) for share in (1.0, 0.3)]
-        costs = [float(np.mean(r[0] ** 2)), *(problem.residuals(terms, tries, pick) ** 2).mean((1, 2))]
+        costs = [float(robust(x, scale)) for x in (r[0], *problem.residuals(terms, tries, pick))]
         i = int(np.argmin(costs))
         key = frozenset(t.label + str(t.fixed) for t in terms)
         if key not in best or costs[i] < best[key].cost:
             best[key] = Proposal(terms, tuple([start, *tries][i]), float(costs[i]))
     return sorted(best.values(), key=lambda p: p.cost)
+
+
+def sharpen(setup: Setup[Any], ranked: list[Proposal], effort: Effort) -> list[Proposal]:
+    """Order proposals anew after a few iterations on some windows: one step says little of some effects."""
+    pick, out = _spread(setup.fitted, effort.screen), []
+    scale = typical(setup.baseline.r)
+    for p in ranked:
+        f = fit(setup.problem, p.terms, p.start, pick, effort.quick)
+        out.append(Proposal(f.terms, f.values, float(robust(f.r, scale))))
+    return sorted(out, key=lambda p: p.cost)
 
 
 def _moved(terms: Sequence[Term], start: Sequence[Array], new: int, step: Array, old: int) -> list[Array]:

@@ -51,7 +51,13 @@ def _lag(plant: Plant, at: tuple[str, ...], values: Mapping[str, float]) -> Chan
     return _on(plant, at, low_pass)
 
 
+def _late(plant: Plant, at: tuple[str, ...], values: Mapping[str, float]) -> Change:
+    names = at or tuple(f"qpos/{j}" for j in plant.joints)
+    return Change(late={name.removeprefix("qpos/"): values["delay"] for name in names})
+
+
 SIGNALS: dict[str, Build] = {
     "actuator_delay": _delay,
     "actuator_lag": _lag,
+    "sensor_delay": _late,
 }

@@ -70,6 +70,7 @@ TABLE: dict[str, Row] = {
     "sensor_offset": Row({"offset": Par(0.0, lambda s: s.travel, (0.1, -0.1), -3.0, 3.0)}),
     "sensor_gain": Row({"gain": Par(1.0, lambda s: 1.0, (-0.05, 0.05), -0.8, 2.0)}),
     "actuator_delay": Row({"delay": Par(0.0, lambda s: 0.02, (0.25, 1.0), 0.0, 15.0)}),
+    "sensor_delay": Row({"delay": Par(0.0, lambda s: 0.02, (0.25, 1.0), 0.0, 15.0)}),
     "actuator_lag": Row({"time_constant": Par(0.0, lambda s: 0.02, (0.25, 1.0), 0.0, 15.0)}),
 }
 

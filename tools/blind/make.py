@@ -123,7 +123,8 @@ class _Batch:
                 size = float(min(wanted, top)) if np.isfinite(wanted) else top
                 if not np.isfinite(wanted) or wanted > top:
                     fits[i] = False
-                mine.append(max(size, entry.smallest))
+                size = max(size, entry.smallest)
+                mine.append(np.ceil(size / H - 1e-9) * H if given.name == "actuator_delay" else size)  # as it acts
             sizes.append(mine)
         sane = np.zeros(len(self.cases), bool)
         record = calm

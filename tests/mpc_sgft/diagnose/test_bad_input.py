@@ -68,12 +68,21 @@ def test_a_pause_splits_the_recording() -> None:
     assert len(first.ctrl) == len(second.ctrl) == 100 and "1 pauses" in first.notes[0]
 
 
-def test_jitter_is_evened_out() -> None:
-    rng = np.random.default_rng(0)
-    time = np.arange(200) * 0.01 + rng.uniform(-0.002, 0.002, 200)
-    (episode,) = episodes(_table(time=time, qpos__x=np.sin(time)), ["motor"], RANGES)
-    even = time[0] + episode.dt * np.arange(len(episode.ctrl))
-    np.testing.assert_allclose(episode.signals["qpos/x"], np.sin(even), atol=1e-6)
+def test_scattered_stamps_do_not_move_the_commands() -> None:
+    rng, ticks = np.random.default_rng(0), np.arange(2000) * 0.01
+    time, ctrl = ticks + rng.uniform(-0.002, 0.002, 2000), rng.normal(size=2000)
+    table = _table(time=time, ctrl__motor=ctrl, qpos__x=np.sin(time))
+    (episode,) = episodes(table, ["motor"], RANGES)
+    assert episode.scattered and abs(episode.dt - 0.01) < 1e-6
+    np.testing.assert_array_equal(episode.ctrl[:, 0], ctrl)
+    np.testing.assert_allclose(episode.signals["qpos/x"], np.sin(ticks), atol=3e-4)  # the stamps are off by up to 2e-3
+
+
+def test_an_uneven_clock_holds_each_command_from_its_own_time() -> None:
+    time = np.cumsum(np.r_[0.0, np.tile([0.008, 0.008, 0.008, 0.016], 100)])
+    (episode,) = episodes(_table(time=time, ctrl__motor=np.arange(401.0), qpos__x=np.sin(time)), ["motor"], RANGES)
+    held = np.searchsorted(time, time[0] + episode.dt * np.arange(len(episode.ctrl)) + 1e-6, side="right") - 1
+    np.testing.assert_array_equal(episode.ctrl[:, 0], held)
 
 
 def test_files_and_folders(tmp_path: Path) -> None:

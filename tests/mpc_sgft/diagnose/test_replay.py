@@ -49,6 +49,44 @@ def test_a_delay_reaches_back_before_the_window(plant) -> None:
     np.testing.assert_allclose(replayer.simulate([late]), shifted.simulate([Change()]), atol=1e-12)
 
 
+def test_a_late_sensor_shows_what_was_true_before(plant) -> None:
+    episode = _sine()
+    old = np.r_[np.zeros(50), episode.signals["qpos/x"][:-50]]  # read 50 ms late
+    replayer = Replayer(plant, [Episode("late", 0.001, episode.ctrl, {"qpos/x": old})], 0.5, ["qpos/x"])
+    late = make_term(plant, "sensor_delay", "qpos/x", Scales()).build(np.array([0.05]))
+    error = (replayer.simulate([late, Change()]) - replayer.windows.measured)[:, 1:]  # the first window begins before
+    assert np.abs(error[0]).max() < 1e-4 < 3e-3 < np.abs(error[1]).max()
+
+
+def test_a_force_is_what_the_joint_feels() -> None:
+    plant = Plant(mujoco.MjSpec.from_string(SLIDE.replace('joint="x"/>', 'joint="x" gear="7"/>'))).sharper()
+    episode = _sine()
+    replayer = Replayer(
+        plant,
+        [Episode("force", 0.001, episode.ctrl, {**episode.signals, "force/motor": episode.ctrl[:, 0]})],
+        0.5,
+        ["force/motor"],
+    )
+    np.testing.assert_allclose(replayer.simulate([Change()])[0], 7 * replayer.windows.measured, atol=1e-12)
+
+
+def test_in_sharper_steps_dry_friction_turns_at_once() -> None:
+    """m q'' = F - f sign(q'), from v > 0: by hand it stops at t = m v / (f - F), and goes back with (F + f) / m."""
+    m, f, push, v = 2.0, 3.0, -30.0, 0.1
+    scene = SLIDE.replace('axis="1 0 0"', f'axis="1 0 0" frictionloss="{f}"')
+    turn = m * v / (f - push)
+    t = np.arange(100) * 0.002
+    q = np.where(t < turn, v * t + (push - f) / m * t**2 / 2, v * turn / 2 + (push + f) / m * (t - turn) ** 2 / 2)
+    episode = Episode("turn", 0.002, np.full((100, 1), push), {"qpos/x": q})
+    errors = []
+    for plant in (Plant(mujoco.MjSpec.from_string(scene)), Plant(mujoco.MjSpec.from_string(scene)).sharper()):
+        replayer = Replayer(plant, [episode], 0.19, ["qpos/x"])
+        w = replayer.windows
+        replayer.windows = w._replace(q0=np.zeros((1, 1)), v0=np.full((1, 1), v), a0=np.full((1, 1), (push - f) / m))
+        errors.append(np.abs(replayer.simulate([Change()])[0] - w.measured).max())
+    assert errors[1] < 2e-4 < 6e-4 < errors[0]
+
+
 def test_effects_in_one_batch_do_not_disturb_each_other(plant) -> None:
     replayer = Replayer(plant, [_sine()], 0.5, ["qpos/x"])
     terms = candidates(plant, {"x": Scales(), "motor": Scales(), "cart": Scales(), "qpos/x": Scales()}, None)
