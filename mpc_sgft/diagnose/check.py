@@ -48,6 +48,8 @@ def episodes(table: Table, actuators: Sequence[str], joints: dict[str, tuple[flo
     _units(table, joints)
     _moves(table, actuators, list(joints))
     notes = (f"{table.name}: {table.lost}",) if table.lost else ()
+    if all(np.ptp(columns[f"ctrl/{a}"]) == 0 for a in actuators):
+        notes += (f"{table.name}: the commands are constant: what acts on commands cannot show here",)
     cuts = np.flatnonzero(steps > GAP * dt) + 1
     pieces = [p for p in np.split(np.arange(len(time)), cuts) if len(p) >= MIN_SAMPLES]
     if len(cuts):

@@ -11,7 +11,6 @@ from typing import Any
 import mujoco
 import numpy as np
 import yaml
-from tqdm import tqdm
 
 from envs.effects.base import Effect
 from mpc_sgft.diagnose.chain import Chain, Prediction, effects_of
@@ -27,6 +26,7 @@ from mpc_sgft.diagnose.run import candidate_rows, effect_rows, reduction
 from mpc_sgft.diagnose.search import Effort, Entry, search
 from mpc_sgft.diagnose.suspects import gap_of, suspects
 from mpc_sgft.errors import UserError
+from mpc_sgft.log import progress as bar_of
 
 LENGTH = 6  # control steps in a window
 MOST = 64  # windows
@@ -67,11 +67,11 @@ def diagnose_run(
     deployment = read_deployment(run)
     setup = prepare(deployment, window, held_out)
     terms = [s.term() for s in suspects(deployment.task, effects)]
-    with tqdm(total=100, desc="diagnose", disable=not progress, bar_format="{desc} {bar} {n:.0f}% {postfix}") as bar:
+    with bar_of(100, desc="diagnose", unit="%", disable=not progress) as bar:
 
         def show(what: str, share: float) -> None:
             bar.set_postfix_str(what)
-            bar.update(95 * share - bar.n)
+            bar.update(round(95 * share) - bar.n)
 
         entries = search(setup, terms, max_effects, rng, show, EFFORT)
         verdict = judge_entries(setup, entries, None, rng)

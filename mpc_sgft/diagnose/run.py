@@ -9,7 +9,6 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from tqdm import tqdm
 
 from mpc_sgft.diagnose import judge, repair
 from mpc_sgft.diagnose.check import episodes
@@ -29,6 +28,7 @@ from mpc_sgft.diagnose.report import MAX_CANDIDATES, Report
 from mpc_sgft.diagnose.search import Entry, search
 from mpc_sgft.diagnose.table import TABLE
 from mpc_sgft.errors import UserError
+from mpc_sgft.log import progress as bar_of
 
 
 def read(plant: Plant, data: Sequence[str | Path]) -> list[Episode]:
@@ -67,11 +67,11 @@ def run(
     sharp = plant.sharper()
     setup = prepare(sharp, recorded, nominal_terms(plant, uncertain), window=window, signals=signals, held_out=held_out)
     sizes = scales(sharp, setup.problem.replayer)
-    with tqdm(total=100, desc="diagnose", disable=not progress, bar_format="{desc} {bar} {n:.0f}% {postfix}") as bar:
+    with bar_of(100, desc="diagnose", unit="%", disable=not progress) as bar:
 
         def show(what: str, share: float) -> None:
             bar.set_postfix_str(what)
-            bar.update(90 * share - bar.n)
+            bar.update(round(90 * share) - bar.n)
 
         entries = search(setup, candidates(sharp, sizes, effects), max_effects, rng, show)
         best = choose_set(setup, entries, rng)

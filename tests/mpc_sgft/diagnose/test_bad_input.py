@@ -55,6 +55,15 @@ def test_numbers_that_cannot_be(changed: dict[str, np.ndarray], message: str) ->
         episodes(_table(**changed), ["motor"], RANGES)
 
 
+def test_a_constant_command_is_told() -> None:
+    (episode,) = episodes(
+        _table(ctrl__motor=np.ones(200)), ["motor"], RANGES
+    )  # a joint that swings out still tells much
+    assert any("the commands are constant" in note for note in episode.notes)
+    with pytest.raises(UserError, match="no joint moves, and the commands are constant"):
+        episodes(_table(ctrl__motor=np.ones(200), qpos__x=np.ones(200)), ["motor"], RANGES)
+
+
 def test_missing_time() -> None:
     table = _table()
     del table.columns["time"]
