@@ -1,0 +1,57 @@
+"""The fit and the comparison on numbers made by hand: a straight line over windows, one of which is wild."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from mpc_sgft.diagnose import judge
+from mpc_sgft.diagnose.fit import fit, left_out_errors
+from mpc_sgft.diagnose.library import Term
+from mpc_sgft.diagnose.plant import Change
+
+SLOPE = Term(
+    effect="slope",
+    at=(),
+    names=("a",),
+    units=("1",),
+    neutral=np.zeros(1),
+    low=np.full(1, -10.0),
+    high=np.full(1, 10.0),
+    size=np.ones(1),
+    starts=(np.full(1, 0.1),),
+    build=lambda x: Change(),
+)
+
+
+class Line:
+    """r = a x - y with y = 2 x and unit noise, 20 windows of 40 points; in the last one y is 50 higher."""
+
+    blocks = 40
+
+    def __init__(self) -> None:
+        rng = np.random.default_rng(0)
+        self.x = rng.normal(0, 3, (20, 40))
+        self.y = 2.0 * self.x + rng.normal(size=self.x.shape)
+        self.y[-1] += 50.0 + 20.0 * self.x[-1]
+
+    def residuals(self, terms: Sequence[Term], points: Sequence[Sequence[np.ndarray]], pick: np.ndarray) -> np.ndarray:
+        return np.stack([p[0][0] * self.x[pick] - self.y[pick] for p in points])
+
+
+def test_a_wild_window_does_not_pull_the_fit() -> None:
+    line, every = Line(), np.arange(20)
+    f = fit(line, [SLOPE], [SLOPE.starts[0]], every)
+    least_squares = float((line.x * line.y).sum() / (line.x**2).sum())
+    assert abs(f.values[0][0] - 2.0) < 0.05 < 0.5 < abs(least_squares - 2.0)
+    errors = left_out_errors(f, every // 3)
+    assert errors[:-1].max() < 2.5 and errors[-1] > 1000  # and it is judged as it is
+
+
+def test_a_gain_in_a_few_windows_is_credible_and_one_in_a_single_window_is_not() -> None:
+    rng = np.random.default_rng(0)
+    before, few, one = np.zeros(40), np.zeros(40), np.zeros(40)
+    few[:8], one[0] = -1.0, -8.0
+    assert judge.credible(before, few, rng) and not judge.credible(before, one, rng)
+    assert not judge.credible(before, before - 0.01, rng)  # real, and too small for a name
