@@ -50,6 +50,7 @@ class Stream:
         self.began_time = self.state.time
         self.told = self.state.q.copy()
         self.samples: list[Sample] = []
+        self._noted = float("-inf")  # time of the last sample
         self._path, self._at = self.told[None], 0
         self._ending = False
         if moves:
@@ -123,7 +124,15 @@ class Stream:
                 self._at += 1
                 if self.moves:
                     self.arm.aim(self.told)
-            self.samples.append(Sample(self.clock.now(), state.q, state.dq, state.torque, self.told))
+            self._note(Sample(self.clock.now(), state.q, state.dq, state.torque, self.told))
+
+    def _note(self, sample: Sample) -> None:
+        """Keep a sample; of several at one time (a delay is made up while the robot's clock stands) the last."""
+        if sample.time > self._noted:
+            self._noted = sample.time
+            self.samples.append(sample)
+        elif self.samples:
+            self.samples[-1] = sample._replace(time=self._noted)
 
     def _stop(self, why: str) -> None:
         self.doubt, self.doubt_time = why, time.monotonic()

@@ -1,6 +1,7 @@
 """The real client against a controller that speaks the robot's protocol: it moves as told, and no further."""
 
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -26,6 +27,20 @@ def test_the_arm_moves_as_told_and_everything_is_recorded(robot: FrankaBackend) 
     times = np.concatenate([r["time"] for r in rows if r])
     assert (np.diff(times) > 0).all() and len(times) / (times[-1] - times[0]) > 100  # [Hz]
     assert robot.pace.report()["period_median_s"] == pytest.approx(0.2, abs=0.005)
+
+
+def test_no_two_samples_have_one_time(robot: FrankaBackend, monkeypatch: pytest.MonkeyPatch) -> None:
+    stream = robot.rig.stream
+    stream.hold()
+    stream.take_samples()
+    now = stream.clock.now() + 100.0
+    monkeypatch.setattr(stream, "clock", SimpleNamespace(now=lambda: now))
+    for _ in range(3):
+        stream._tick()
+    times = [s.time for s in stream.take_samples()]
+    assert times.count(now) == 1 and times == sorted(set(times))
+    stream._tick()
+    assert stream.take_samples() == []
 
 
 def test_a_move_out_of_the_box_is_cut_and_says_so(stand_in: StandIn, on_stand_in) -> None:
