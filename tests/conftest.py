@@ -9,10 +9,13 @@ import sys
 from collections.abc import Callable
 from ctypes.util import find_library
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+
+if TYPE_CHECKING:
+    from envs.tasks.push import Push
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch is imported: workers must not fight over the cores
 
@@ -79,3 +82,17 @@ def render(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., tuple[np.n
             return pictures["color"], pictures["depth"]
 
     return draw
+
+
+@pytest.fixture(scope="session")
+def robot_push() -> Push:
+    """Push as it stands in front of a robot."""
+    import yaml
+
+    from envs.tasks.push import Push
+    from mpc_sgft.choices import CONFIG_DIR
+
+    settings = yaml.safe_load((CONFIG_DIR / "task" / "push.yaml").read_text())
+    env = {**settings["env"], **settings["on_robot"]}
+    env.pop("_target_")
+    return Push(**env)

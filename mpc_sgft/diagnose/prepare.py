@@ -93,7 +93,10 @@ def prepare(
     base = fit(problem, nominal, base.values, fitted)
     blocks = np.minimum(np.arange(len(fitted)) * BLOCKS // len(fitted), BLOCKS - 1)
     least = problem.floor_share[np.concatenate([fitted, held])]  # below this, an error says nothing about the machine
-    judged = lambda errors: np.log1p(np.maximum(errors, least))  # noqa: E731, two lines are shorter than a function
+
+    def judged(errors: Array) -> Array:
+        return np.log1p(np.maximum(errors, least))
+
     return Setup(problem, fitted, held, blocks, base, noise, np.median(floor[0], (0, 1)), judged, NOISE)
 
 

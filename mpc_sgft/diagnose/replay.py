@@ -206,10 +206,11 @@ class Replayer:
             elif kind == "qvel":
                 i = self.plant.joints.index(part)
                 columns.append(_at(qvel[..., i], (times + self.half - late[:, i, None]) / self.h))
+            elif kind == "force":  # of the command from this sample on, and from the actuator's to its joint's
+                felt = m.actuator(part).gear[0] * sensed[..., int(m.sensor(f"{FORCE}{part}").adr[0])]
+                columns.append(_at(felt, (times + 2 * self.half) / self.h))
             else:
-                sensor = m.sensor(f"{FORCE}{part}" if kind == "force" else part)
-                gear = m.actuator(part).gear[0] if kind == "force" else 1.0  # from the actuator's force to its joint's
-                columns.append(gear * _at(sensed[..., int(sensor.adr[0])], (times + 2 * self.half) / self.h))
+                columns.append(_at(sensed[..., int(m.sensor(part).adr[0])], times / self.h))
         return np.stack(columns, -1)
 
     def _ctrl(self, change: Change) -> Array:

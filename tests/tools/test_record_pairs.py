@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
 
 cv2 = pytest.importorskip("cv2", reason="needs the camera extra")
 pytest.importorskip("pyrealsense2", reason="needs the camera extra and libusb-1.0-0", exc_type=ImportError)
@@ -19,7 +18,6 @@ pytest.importorskip("franky_sim", reason="needs pip install mpc_sgft[franka-sim]
 from envs.kinematics import tip_position  # noqa: E402
 from envs.stand_in.client import StandIn  # noqa: E402
 from envs.tasks.push import Push  # noqa: E402
-from mpc_sgft.choices import CONFIG_DIR  # noqa: E402
 from tools.calibrate_camera import main  # noqa: E402
 
 TESTS = Path(__file__).resolve().parents[1]
@@ -30,16 +28,8 @@ SECONDS = 8  # of film
 
 
 @pytest.fixture(scope="module")
-def push() -> Push:
-    settings = yaml.safe_load((CONFIG_DIR / "task" / "push.yaml").read_text())
-    env = {**settings["env"], **settings["on_robot"]}
-    env.pop("_target_")
-    return Push(**env)
-
-
-@pytest.fixture(scope="module")
-def stand_in(push: Push) -> Iterator[StandIn]:
-    running = StandIn(push)
+def stand_in(robot_push: Push) -> Iterator[StandIn]:
+    running = StandIn(robot_push)
     yield running
     running.close()
 
@@ -68,12 +58,14 @@ def record(film: str, monkeypatch: pytest.MonkeyPatch) -> Callable[..., int]:
     return run
 
 
-def test_each_pair_is_a_new_picture_and_where_the_hand_was(record, push: Push, stand_in: StandIn, tmp_path) -> None:
+def test_each_pair_is_a_new_picture_and_where_the_hand_was(
+    record, robot_push: Push, stand_in: StandIn, tmp_path
+) -> None:
     assert record(stand_in.ip, tmp_path / "pairs", "\n\n\nq\n") == 0
     found = json.loads((tmp_path / "pairs" / "pairs.json").read_text())
     assert found["serial"] == "77" and found["intrinsics"].items() >= LENS.items()
     assert [pair["image"] for pair in found["pairs"]] == ["00.png", "01.png", "02.png"]
-    start = push.start(np.random.default_rng(0)).qpos[:1, :7]
+    start = robot_push.start(np.random.default_rng(0)).qpos[:1, :7]
     numbers = []
     for pair in found["pairs"]:
         pose = np.array(pair["base_T_hand"])

@@ -30,15 +30,6 @@ def robot_config() -> dict:
     return yaml.safe_load((CONFIG_DIR / "backend" / "franka.yaml").read_text())
 
 
-@pytest.fixture(scope="session")
-def robot_push() -> Push:
-    """Push as it stands in front of a robot."""
-    settings = yaml.safe_load((CONFIG_DIR / "task" / "push.yaml").read_text())
-    env = {**settings["env"], **settings["on_robot"]}
-    env.pop("_target_")
-    return Push(**env)
-
-
 @pytest.fixture
 def stand_in(robot_push: Push) -> Iterator[StandIn]:
     pytest.importorskip("franky", reason="needs pip install mpc_sgft[franka]")
