@@ -90,7 +90,7 @@ class Problem:
         sensitivity: Derivative of the predictions by the start, [W, n, S, 2 nj].
 
     Attributes:
-        floor_share: Of each window's expected error, how much is the simulator's, 0…1, [W].
+        floor_share: Of each residual's expected square, how much is the simulator's, 0…1, [W, m].
     """
 
     def __init__(self, replayer: Replayer, sigma: Array, floor: Array, start_sd: Array, sensitivity: Array):
@@ -101,7 +101,7 @@ class Problem:
         self.target = self._average(replayer.windows.measured)
         noise = sigma / np.sqrt(self.stride)
         self.scale = np.sqrt(noise**2 + np.minimum((self._average(floor) ** 2).sum(0), (MOST_FLOOR * noise) ** 2))
-        self.floor_share = (1 - (noise / self.scale) ** 2).mean((1, 2))
+        self.floor_share = (1 - (noise / self.scale) ** 2).reshape(len(self.scale), -1)
         moved = self._average(np.moveaxis(sensitivity, -1, 0)) / self.scale  # [2 nj, W, nb, S]
         a = moved.reshape(*moved.shape[:2], -1).transpose(1, 2, 0) * start_sd[:, None]  # [W, m, 2 nj]
         self.u, s, _ = np.linalg.svd(a, full_matrices=False)
@@ -211,28 +211,35 @@ class _Flat:
         return np.where(x + STEP > self.high, -STEP, STEP)
 
 
-def window_errors(problem: Residuals, f: Fit, pick: Index) -> Array:
-    """Mean whitened square of a fitted structure on windows that it may not have seen, [W]."""
-    return (problem.residuals(f.terms, [f.values], pick)[0] ** 2).mean(1)
+def by_parts(squares: Array, parts: int) -> Array:
+    """Means of [W, m] over equal parts of each row, one after the other, [W parts]."""
+    edges = np.linspace(0, squares.shape[1], parts + 1).astype(int)
+    return (np.add.reduceat(squares, edges[:-1], axis=1) / np.diff(edges)).ravel()
 
 
-def left_out_errors(f: Fit, blocks: Index) -> Array:
-    """Error of each fitted window when its block is left out of the fit, to first order, [W].
+def window_errors(problem: Residuals, f: Fit, pick: Index, parts: int = 1) -> Array:
+    """Mean whitened square of a fitted structure on windows that it may not have seen, [W parts]."""
+    return by_parts(problem.residuals(f.terms, [f.values], pick)[0] ** 2, parts)
+
+
+def left_out_errors(f: Fit, blocks: Index, parts: int = 1) -> Array:
+    """Error of each fitted window when its block is left out of the fit, to first order, [W parts].
 
     Args:
         f: The fit.
         blocks: Block of each fitted window, [W].
+        parts: Of each window, that are judged apart.
     """
     count = f.J.shape[-1]
     if not count:
-        return (f.r**2).mean(1)
+        return by_parts(f.r**2, parts)
     weight = f.weights
     per = np.einsum("w,wmp,wmq->wpq", weight, f.J, f.J, optimize=True)
-    total, out = per.sum(0), np.empty(len(f.r))
+    total, out = per.sum(0), np.empty(f.r.shape)
     ridge = 1e-9 * np.eye(count) * max(float(np.trace(total)) / count, 1e-30)
     for b in np.unique(blocks):
         mine = blocks == b
         rest = total - per[mine].sum(0) + ridge
         moved = np.linalg.solve(rest, np.einsum("w,wmp,wm->p", weight[mine], f.J[mine], f.r[mine], optimize=True))
-        out[mine] = ((f.r[mine] + f.J[mine] @ moved) ** 2).mean(1)
-    return out
+        out[mine] = (f.r[mine] + f.J[mine] @ moved) ** 2
+    return by_parts(out, parts)

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mpc_sgft.diagnose.fit import change_of
+from mpc_sgft.diagnose.fit import by_parts, change_of
 from mpc_sgft.diagnose.prepare import Setup
 from mpc_sgft.diagnose.record import Array, Index
 from mpc_sgft.diagnose.search import Entry
@@ -64,12 +64,12 @@ def flexible_fit(setup: Setup, best: Entry, scales: dict[str, Scales], rng: np.r
     weight = best.fit.weights[:, None, None]  # as the named effects were fitted
     Xw, rw = X[fitted] * np.sqrt(weight), r0[fitted] * np.sqrt(weight[..., 0])
     free = free * len(fitted) * r0.shape[1]
-    choices = [(_left_out(Xw, rw, setup.blocks, lam * free) / weight[:, 0, 0], lam) for lam in RIDGES]
-    errors, lam = min(choices, key=lambda c: float(np.log1p(c[0]).mean()))
+    choices = [(_left_out(Xw, rw, setup.blocks, lam * free) / weight[..., 0], lam) for lam in RIDGES]
+    squares, lam = min(choices, key=lambda c: float(np.log1p(c[0].mean(1)).mean()))
     w = _solve(Xw, rw, lam * free)
     held = X[len(fitted) :, :, : J_all.shape[-1]] @ w[: J_all.shape[-1]]
-    held_errors = ((r0[len(fitted) :] + held) ** 2).mean(1)
-    return Flexible(setup.judged(np.concatenate([errors, held_errors])), (w / norm)[: J_all.shape[-1]], lam)
+    squares = np.concatenate([squares, (r0[len(fitted) :] + held) ** 2])
+    return Flexible(setup.judged(by_parts(squares, setup.parts)), (w / norm)[: J_all.shape[-1]], lam)
 
 
 def _features(setup: Setup, scales: dict[str, Scales], rng: np.random.Generator) -> Array:
@@ -112,12 +112,12 @@ def _solve(X: Array, r: Array, ridge: Array) -> Array:
 
 
 def _left_out(X: Array, r: Array, blocks: Index, ridge: Array) -> Array:
-    """Error of each window when its block is left out of the ridge regression, [W]."""
+    """Squares of each window when its block is left out of the ridge regression, [W, m]."""
     A = np.einsum("wmp,wmq->wpq", X, X)
     g = np.einsum("wmp,wm->wp", X, r)
-    total_A, total_g, out = A.sum(0) + np.diag(ridge), g.sum(0), np.empty(len(r))
+    total_A, total_g, out = A.sum(0) + np.diag(ridge), g.sum(0), np.empty(r.shape)
     for b in np.unique(blocks):
         mine = blocks == b
         w = -np.linalg.solve(total_A - A[mine].sum(0), total_g - g[mine].sum(0))
-        out[mine] = ((r[mine] + X[mine] @ w) ** 2).mean(1)
+        out[mine] = (r[mine] + X[mine] @ w) ** 2
     return out

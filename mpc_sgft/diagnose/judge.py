@@ -15,6 +15,7 @@ TIE_LEVEL = 0.90  # ... while a rival of the same size must be worse with this o
 FEW = 12  # windows
 MIN_GAIN = 0.05  # in log(1 + e): a gain below is not worth a name ...
 MIN_SHARE = 0.05  # ... nor one below this share of the error
+ELSEWHERE = 0.02  # in log(1 + e), left of a gain without its best window: one window may have gone wrong by itself
 
 
 class Interval(NamedTuple):
@@ -44,10 +45,19 @@ def gain(worse: Array, better: Array, level: float, rng: np.random.Generator) ->
     return Interval(mean, min(float(low), mean - half), max(float(high), mean + half))
 
 
-def credible(worse: Array, better: Array, rng: np.random.Generator, level: float = GAIN_LEVEL) -> bool:
-    """Whether the gain is real, and large enough to matter."""
-    g = gain(worse, better, 2 * level - 1, rng)
-    return g.low > 0 and g.mean > max(MIN_GAIN, MIN_SHARE * float(worse.mean()))
+def credible(worse: Array, better: Array, rng: np.random.Generator, parts: int = 1, least: float = MIN_GAIN) -> bool:
+    """Whether the gain is real, in more than one window, and large enough to matter.
+
+    Args:
+        worse, better: Errors of the same parts of the same windows, [W parts].
+        rng: For the bootstrap.
+        parts: Of each window.
+        least: Gain that matters.
+    """
+    g = gain(worse, better, 2 * GAIN_LEVEL - 1, rng)
+    windows = (worse - better).reshape(-1, parts).mean(1)
+    elsewhere = (windows.sum() - windows.max()) / max(len(windows) - 1, 1)
+    return g.low > 0 and g.mean > max(least, MIN_SHARE * float(worse.mean())) and bool(elsewhere > ELSEWHERE)
 
 
 def worse(rival: Array, best: Array, rng: np.random.Generator) -> bool:

@@ -83,7 +83,7 @@ def candidates(plant: Plant, scales: Mapping[str, Scales], effects: Sequence[str
     built = []
     for name in (n for n in possible if effects is None or n in effects):
         for place in driven if TABLE[name].driven else places[kind_of(name).place]:
-            variants = load_positions(plant, place) if name == "payload" else [{}]
+            variants = load_positions(plant, place) if name == "payload" else TABLE[name].variants
             built += [make_term(plant, name, place, scales.get(place, Scales()), fixed) for fixed in variants]
     return built
 
@@ -113,7 +113,8 @@ def kind_of(name: str) -> type[Effect]:
 
 def make_term(plant: Plant, name: str, place: str, scales: Scales, fixed: Mapping[str, Any] | None = None) -> Term:
     """One effect at one place ("" for the whole scene)."""
-    kind, parameters = kind_of(name), TABLE[name].parameters
+    kind = kind_of(name)
+    parameters = {p: par for p, par in TABLE[name].parameters.items() if p not in (fixed or {})}
     pars = list(parameters.values())
     sizes = np.array([par.size(scales) for par in pars])
     neutral = np.array([par.neutral(scales) if callable(par.neutral) else par.neutral for par in pars])

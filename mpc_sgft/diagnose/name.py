@@ -11,13 +11,13 @@ from scipy import stats
 from mpc_sgft.diagnose import judge
 from mpc_sgft.diagnose.fit import fit
 from mpc_sgft.diagnose.flexible import Flexible
-from mpc_sgft.diagnose.prepare import NOISE, Setup
+from mpc_sgft.diagnose.prepare import ABOVE_NOISE, NOISE, Setup
 from mpc_sgft.diagnose.record import Array
 from mpc_sgft.diagnose.search import Entry, entry
 from mpc_sgft.diagnose.table import EQUIVALENT, Equivalence
 
 UNEXPLAINED = 0.05  # share of what any model can explain that named effects may miss before the answer is "unknown"
-ABOVE_NOISE = 0.25  # in log(1 + e): an error that is no more above the noise's needs no further name
+NEXT_GAIN = 0.1  # in log(1 + e), of one more effect where those before leave noise alone
 WIDER = 1.3  # of intervals: what windows that begin at each other's ends share; set on development seeds
 EXPLAINED = 0.75  # share of the error above noise that names must explain
 
@@ -45,11 +45,17 @@ def choose(setup: Setup[Any], entries: list[Entry], rng: np.random.Generator) ->
     current = entries[0]
     while True:
         larger = [e for e in entries if e.complexity > current.complexity and e.error < current.error]
-        better = [e for e in larger if judge.credible(current.errors, e.errors, rng)]
+        better = [e for e in larger if gains(setup, current, e, rng)]
         if not better:
             return prune(setup, current, entries, rng)
         smallest = min(e.complexity for e in better)
         current = min((e for e in better if e.complexity == smallest), key=lambda e: e.error + judge.MIN_GAIN * e.idle)
+
+
+def gains(setup: Setup[Any], small: Entry, large: Entry, rng: np.random.Generator) -> bool:
+    """Whether a larger set is credibly better; where effects leave noise alone, one more must gain more."""
+    least = NEXT_GAIN if small.effects and settled(small) else judge.MIN_GAIN
+    return judge.credible(small.errors, large.errors, rng, setup.parts, least)
 
 
 def prune(setup: Setup[Any], best: Entry, entries: list[Entry], rng: np.random.Generator) -> Entry:
@@ -65,7 +71,7 @@ def prune(setup: Setup[Any], best: Entry, entries: list[Entry], rng: np.random.G
             terms = [best.fit.terms[k] for k in keep]
             without = entry(setup, fit(setup.problem, terms, [best.fit.values[k] for k in keep], setup.fitted))
             entries.append(without)
-        if not judge.credible(without.errors, best.errors, rng):
+        if not gains(setup, without, best, rng):
             return prune(setup, without, entries, rng)
     return best
 
@@ -90,7 +96,7 @@ def judge_entries(
     probability |= {e.key: float(s) for e, s in zip(rivals, shares, strict=True)}
     declared = [(e, equivalence(best, e)) for e in find_ties(best, entries, rng)]
     base = entries[0]
-    if flexible is not None and beats(flexible, best, base, rng):
+    if flexible is not None and beats(flexible, best, base, setup.parts, rng):
         missed = (best.error - flexible.error) / max(base.error - flexible.error, 1e-12)
         reason = f"a flexible residual model explains {missed:.0%} more of the error than {_list(best)}"
         ties = [(e, "" if q is None else q.reason) for e, q in declared]
@@ -98,11 +104,11 @@ def judge_entries(
     times = np.sqrt(np.expm1(best.error))
     if not best.effects:
         reason = "the nominal model's error is within noise and the simulator's floor"
-        if base.error > NOISE + ABOVE_NOISE:
+        if not settled(base):
             reason = f"nothing explains the rest, {times:.1f} times noise and floor, on windows that were not fitted"
         return Verdict("none", best, [], probability, reason)
     left = np.expm1(best.error) - 1.0
-    if best.error > NOISE + ABOVE_NOISE and left > (1 - EXPLAINED) * (np.expm1(base.error) - 1.0):
+    if not settled(best) and left > (1 - EXPLAINED) * (np.expm1(base.error) - 1.0):
         reason = f"{_list(best)} leaves {times:.1f} times noise and floor, which no name in the library explains"
         return Verdict("unknown", best, [(e, "" if q is None else q.reason) for e, q in declared], probability, reason)
     best, open_ties = canonical(best, declared)
@@ -141,9 +147,14 @@ def canonical(best: Entry, ties: list[tuple[Entry, Equivalence | None]]) -> tupl
     return best, unresolved
 
 
-def beats(flexible: Flexible, best: Entry, base: Entry, rng: np.random.Generator) -> bool:
+def settled(best: Entry) -> bool:
+    """Whether a set leaves nothing that is worth a further name."""
+    return best.error < NOISE + ABOVE_NOISE
+
+
+def beats(flexible: Flexible, best: Entry, base: Entry, parts: int, rng: np.random.Generator) -> bool:
     """Whether something that no name in the library covers is clearly there."""
-    if best.error < NOISE + ABOVE_NOISE or not judge.credible(best.errors, flexible.errors, rng):
+    if settled(best) or not judge.credible(best.errors, flexible.errors, rng, parts):
         return False
     return best.error - flexible.error > UNEXPLAINED * (base.error - flexible.error)
 

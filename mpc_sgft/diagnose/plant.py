@@ -27,7 +27,7 @@ class Change:
         edits: Applied to a copy of the scene, in order.
         commands: f(ctrl [T, nu], dt) -> [T, nu], applied to the recorded commands, in order.
         delay: Seconds by which each actuator's command is late, [nu] or a number.
-        frictions: f(load [M, nj]) -> level of dry friction [M, nj], applied along the recorded motion.
+        frictions: f(load [M, nj]) -> level of dry friction [M, nj], set again and again while a simulation runs.
         late: Joint -> seconds by which what is read of it is old.
         reads: f(true signal [M], name) -> what is read of it; affine.
     """

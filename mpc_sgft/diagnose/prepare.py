@@ -9,19 +9,21 @@ from typing import Any, Generic, TypeVar
 import mujoco
 import numpy as np
 
-from mpc_sgft.diagnose.fit import Fit, Problem, Residuals, change_of, fit
+from mpc_sgft.diagnose.fit import Fit, Problem, Residuals, by_parts, change_of, fit
 from mpc_sgft.diagnose.library import Term
 from mpc_sgft.diagnose.plant import Plant, joint_of
 from mpc_sgft.diagnose.record import Array, Episode, Index
 from mpc_sgft.diagnose.replay import Replayer
-from mpc_sgft.diagnose.smooth import noise_of
+from mpc_sgft.diagnose.smooth import noise_of, smooth
 from mpc_sgft.diagnose.table import Scales
 from mpc_sgft.errors import UserError
 
-WINDOW = 0.5  # [s] where the data allow it
-MIN_WINDOWS = 16  # shorter windows rather than fewer
+WINDOW = 1.0  # [s] where the data allow it
+MIN_WINDOWS = 4  # shorter windows rather than fewer
+UNITS = 24  # parts of windows to compare sets on, at least
 BLOCKS = 8  # into which the fitted windows are split for leaving out
 NOISE = float(np.log(2.0))  # log(1 + e) of a window whose error is noise alone, e = 1
+ABOVE_NOISE = 0.25  # in log(1 + e): an error that is no more above the noise's needs no further name
 KICK = 1e-4  # of the typical size, to differentiate by the start
 
 
@@ -39,6 +41,7 @@ class Setup(Generic[P]):
         baseline: The nominal model with uncertain quantities refitted.
         noise, floor: Of each signal, of the sensor and of the simulator (its median), [S].
         quiet: An error below which nothing is left to explain.
+        parts: Into which each window is cut when sets are compared; a few long windows say more than many short ones.
         judged: What of a window's error counts when sets are compared; the error itself by default.
     """
 
@@ -51,12 +54,15 @@ class Setup(Generic[P]):
     floor: Array
     judged: Callable[[Array], Array] = field(default=np.asarray)
     quiet: float = -np.inf
+    parts: int = 1
 
 
-def default_window(episodes: Sequence[Episode]) -> float:
-    """0.5 s, or less if there would be fewer than sixteen windows, but at least ten samples."""
-    total = sum(e.seconds for e in episodes)
-    return max(min(WINDOW, total / MIN_WINDOWS), 10 * episodes[0].dt)
+def default_window(episodes: Sequence[Episode], joints: Sequence[str]) -> float:
+    """At most WINDOW, so that windows fill the shortest episode and there are enough of them; at least ten samples."""
+    dt, shortest = episodes[0].dt, min(len(e.ctrl) - 1 - smooth(e, joints).half for e in episodes)
+    longest = min(WINDOW, sum(e.seconds for e in episodes) / MIN_WINDOWS)
+    pieces = int(np.ceil(shortest * dt / longest - 0.01))
+    return max(10, shortest // pieces) * dt
 
 
 def default_signals(episodes: Sequence[Episode], plant: Plant) -> list[str]:
@@ -79,7 +85,7 @@ def prepare(
     missing = [s for s in chosen if any(s not in e.signals for e in episodes)]
     if missing:
         raise UserError(f"signal {missing[0]!r} is not in every episode. There are: {', '.join(episodes[0].signals)}.")
-    replayer = Replayer(plant, episodes, window or default_window(episodes), chosen)
+    replayer = Replayer(plant, episodes, window or default_window(episodes, plant.joints), chosen)
     if len(replayer.windows.start) < 4:
         raise UserError(f"only {len(replayer.windows.start)} windows: give more data or a shorter --window.")
     fitted, held = split(replayer, held_out)
@@ -92,12 +98,13 @@ def prepare(
     problem = _problem(replayer, noise, floor, nominal, base.values)
     base = fit(problem, nominal, base.values, fitted)
     blocks = np.minimum(np.arange(len(fitted)) * BLOCKS // len(fitted), BLOCKS - 1)
-    least = problem.floor_share[np.concatenate([fitted, held])]  # below this, an error says nothing about the machine
+    parts = max(1, -(-UNITS // len(replayer.windows.start)))
+    least = by_parts(problem.floor_share[np.concatenate([fitted, held])], parts)  # less says nothing of the machine
 
     def judged(errors: Array) -> Array:
         return np.log1p(np.maximum(errors, least))
 
-    return Setup(problem, fitted, held, blocks, base, noise, np.median(floor[0], (0, 1)), judged, NOISE)
+    return Setup(problem, fitted, held, blocks, base, noise, np.median(floor[0], (0, 1)), judged, NOISE, parts)
 
 
 def split(replayer: Any, held_out: float | Sequence[str] | None) -> tuple[Index, Index]:

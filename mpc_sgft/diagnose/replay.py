@@ -17,13 +17,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from envs.effects import place_rotors
-from mpc_sgft.diagnose.plant import FORCE, Change, Plant
+from mpc_sgft.diagnose.plant import FORCE, Change, Plant, joint_of
 from mpc_sgft.diagnose.record import Array, Episode, Index
 from mpc_sgft.diagnose.smooth import smooth
 
 FULL = mujoco.mjtState.mjSTATE_FULLPHYSICS
 CTRL = int(mujoco.mjtState.mjSTATE_CTRL)
 FORCED = CTRL | int(mujoco.mjtState.mjSTATE_QFRC_APPLIED)
+LEVEL = 1e-3  # [s] between two settings of a friction that follows the load
 EXPLODED = 1e6  # predictions are clipped here, so that an unstable candidate is bad, not infinite
 
 
@@ -53,7 +54,7 @@ class Replayer:
     Args:
         plant: The nominal scene.
         episodes: What was measured, all with the same time step.
-        window: Length of a window [s].
+        window: Length of a window [s]. The first starts where smoothing the start has samples on both sides.
         signals: Names of the compared signals; `qpos/…` and `qvel/…` of joints, `force/…` of actuators.
     """
 
@@ -66,7 +67,6 @@ class Replayer:
         self.smooth = [smooth(e, plant.joints) for e in self.episodes]
         self.windows = self._cut(max(2, round(window / self.dt)))
         self._nominal_ctrl: Array | None = None
-        self._along: tuple[Array, Array] | None = None
         self.simulations = 0
 
     def simulate(
@@ -88,10 +88,7 @@ class Replayer:
         pick = np.arange(len(w.start), dtype=np.int_) if pick is None else pick
         models = [self.plant.compile(c) for c in changes]
         out = np.empty((len(changes), len(pick), w.samples, len(self.signals)))
-        if any(c.frictions for c in changes):
-            dry = self._dry_friction(changes, pick)
-            force = dry if force is None else force + dry
-        for group in _alike(models):
+        for group in _alike(models, changes):
             out[group] = self._roll(
                 [models[k] for k in group],
                 [changes[k] for k in group],
@@ -106,7 +103,7 @@ class Replayer:
         """The same starts under other commands: f(ctrl [T, nu]) -> [T, nu] of every episode."""
         other = copy.copy(self)
         other.episodes = [replace(e, ctrl=change(e.ctrl)) for e in self.episodes]
-        other._nominal_ctrl = other._along = None
+        other._nominal_ctrl = None
         return other
 
     @property
@@ -154,14 +151,14 @@ class Replayer:
             first = [a for a in range(m.na) if a < nu]
             state[:, :, 1 + m.nq + m.nv + np.array(first)] = inputs[:, :, 0, first]
         rows = len(models) * count
-        states, sensed = mujoco.rollout.rollout(
-            [x for x in models for _ in range(count)],
-            data,
-            state.reshape(rows, -1),
-            inputs.reshape(rows, self.steps, -1),
-            control_spec=CTRL if force is None else FORCED,
-            skip_checks=False,
-        )
+        starts, driven, control = state.reshape(rows, -1), inputs.reshape(rows, self.steps, -1), FORCED
+        if force is None:
+            control = CTRL
+        if changes[0].frictions:
+            states, sensed = self._rub(models, changes, starts, driven, control)
+        else:
+            each = [x for x in models for _ in range(count)]
+            states, sensed = mujoco.rollout.rollout(each, data, starts, driven, control_spec=control)
         states, sensed = np.asarray(states, float), np.asarray(sensed, float)
         shape = (len(models), count, self.steps)
         qpos = np.concatenate([state[:, :, None, 1 + qadr], states[..., 1 + qadr].reshape(*shape, nj)], 2)
@@ -232,40 +229,60 @@ class Replayer:
             self._nominal_ctrl = out
         return out
 
-    def _dry_friction(self, changes: Sequence[Change], pick: Index) -> Array:
-        """Friction that depends on the actuators' load, along the recorded motion, [K, W, N, nj]."""
-        load, direction = self._along or self._load_and_direction()
-        self._along = (load, direction)
-        flat = load[pick].reshape(-1, load.shape[-1])
-        levels = [sum((f(flat) for f in c.frictions), np.zeros_like(flat)) for c in changes]
-        return -np.reshape(levels, (len(changes), *load[pick].shape)) * direction[pick]
+    def _rub(
+        self,
+        models: list[mujoco.MjModel],
+        changes: list[Change],
+        state: Array,
+        inputs: Array,
+        control: int,
+    ) -> tuple[Array, Array]:
+        """States and sensors where dry friction follows the actuators' load; the level is set every LEVEL seconds.
 
-    def _load_and_direction(self) -> tuple[Array, Array]:
-        """Generalised force of the actuators, and the direction of motion (-1 to 1), at each step, [W, N, nj]."""
-        m, w = self.plant.model, self.windows
-        data = mujoco.MjData(m)
-        load = np.empty((len(w.start), self.steps, m.nv))
-        direction = np.empty_like(load)
-        times = self.step_times()
-        for i, s in enumerate(self.smooth):
-            mine = np.flatnonzero(w.episode == i)
-            rows = np.clip(np.round(times[mine] / self.dt).astype(int), 0, len(s.q) - 1)
-            forces = np.empty_like(s.q)
-            for k in range(len(s.q)):
-                data.qpos[:], data.qvel[:], data.ctrl[:] = s.q[k], s.v[k], self.episodes[i].ctrl[k]
-                mujoco.mj_fwdPosition(m, data)
-                mujoco.mj_fwdVelocity(m, data)
-                mujoco.mj_fwdActuation(m, data)
-                forces[k] = data.qfrc_actuator
-            load[mine] = forces[rows]
-            creep = np.maximum(3 * s.v_sd, 1e-3 * np.abs(s.v).max(0))
-            direction[mine] = np.tanh(s.v / creep)[rows]
-        return load, direction
+        Args:
+            models: One each change, [K].
+            changes: What changes the friction, [K].
+            state: Starts, [K W, …].
+            inputs: Of every step, [K W, N, …].
+            control: What the inputs are.
+        """
+        each = len(state) // len(models)
+        own = [copy.copy(m) for m in models for _ in range(each)]
+        m, data = models[0], mujoco.MjData(models[0])
+        _, vadr = self.plant.addresses(m)
+        losses = [x.dof_frictionloss for x in own]
+        before = np.array(losses)[:, vadr]
+        drives = [(i, m.actuator(a), joint_of(self.plant, a)) for i, a in enumerate(self.plant.actuators)]
+        drives = [(int(m.sensor(f"{FORCE}{a.name}").adr[0]), a.gear[0], j) for _, a, j in drives if j]
+
+        def set_levels(sensed: Array) -> None:
+            load = np.zeros(before.shape)
+            for at, gear, joint in drives:
+                load[:, self.plant.joints.index(joint)] += gear * sensed[:, at]
+            level = before.copy()
+            for k, change in enumerate(changes):
+                mine = slice(k * each, (k + 1) * each)
+                level[mine] += sum((f(load[mine]) for f in change.frictions), np.zeros_like(load[mine]))
+            for loss, row in zip(losses, level, strict=True):
+                loss[vadr] = row
+
+        def steps(inputs: Array) -> tuple[Array, Array]:
+            done = mujoco.rollout.rollout(own, data, state, inputs, control_spec=control)
+            return np.asarray(done[0], float), np.asarray(done[1], float)
+
+        set_levels(steps(inputs[:, :1])[1][:, 0])
+        block = max(1, round(LEVEL / self.h))
+        parts = []
+        for begin in range(0, inputs.shape[1], block):
+            parts.append(steps(inputs[:, begin : begin + block]))
+            state = parts[-1][0][:, -1]
+            set_levels(parts[-1][1][:, -1])
+        return np.concatenate([p[0] for p in parts], 1), np.concatenate([p[1] for p in parts], 1)
 
     def _cut(self, n: int) -> Windows:
         episode, start = [], []
         for i, e in enumerate(self.episodes):
-            first = np.arange(0, len(e.ctrl) - n, n)
+            first = np.arange(self.smooth[i].half, len(e.ctrl) - n, n)
             episode += [i] * len(first)
             start += list(first)
         rows = [(i, np.arange(s + 1, s + n + 1)) for i, s in zip(episode, start, strict=True)]
@@ -285,11 +302,12 @@ class Replayer:
         )
 
 
-def _alike(models: Sequence[mujoco.MjModel]) -> list[list[int]]:
-    """Indices of models of the same layout: only these can be rolled out in one call."""
+def _alike(models: Sequence[mujoco.MjModel], changes: Sequence[Change]) -> list[list[int]]:
+    """Indices of models of the same layout, all with loaded friction or none: these can be rolled out in one call."""
     groups: dict[tuple[int, ...], list[int]] = {}
-    for k, m in enumerate(models):
-        groups.setdefault((m.nq, m.nv, m.nu, m.na, m.nbody, m.ntendon, m.neq, m.nM, m.npair), []).append(k)
+    for k, (m, c) in enumerate(zip(models, changes, strict=True)):
+        layout = (m.nq, m.nv, m.nu, m.na, m.nbody, m.ntendon, m.neq, m.nM, m.npair)
+        groups.setdefault((*layout, bool(c.frictions)), []).append(k)
     return list(groups.values())
 
 

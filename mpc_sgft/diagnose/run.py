@@ -17,7 +17,7 @@ from mpc_sgft.diagnose.fit import change_of
 from mpc_sgft.diagnose.flexible import flexible_fit
 from mpc_sgft.diagnose.library import candidates, numbers
 from mpc_sgft.diagnose.locate import locate
-from mpc_sgft.diagnose.name import Verdict, effect_probability, intervals, judge_entries
+from mpc_sgft.diagnose.name import Verdict, effect_probability, intervals, judge_entries, settled
 from mpc_sgft.diagnose.name import choose as choose_set
 from mpc_sgft.diagnose.nominal import nominal_terms, refit_table
 from mpc_sgft.diagnose.plant import Change, Plant
@@ -75,7 +75,7 @@ def run(
 
         entries = search(setup, candidates(sharp, sizes, effects), max_effects, rng, show)
         best = choose_set(setup, entries, rng)
-        flexible = flexible_fit(setup, best, sizes, rng)
+        flexible = None if settled(best) else flexible_fit(setup, best, sizes, rng)
         verdict = judge_entries(setup, entries, flexible, rng)
         bar.update(100 - bar.n)
     notes = [n for e in recorded for n in e.notes]
@@ -84,7 +84,7 @@ def run(
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
         notes += repair.write(plant, verdict.best, out)
-    report = assemble(plant, setup, entries, verdict, notes, rng, flexible.error)
+    report = assemble(plant, setup, entries, verdict, notes, rng, flexible and flexible.error)
     report.data["seconds"] = round(time.perf_counter() - began, 2)
     if out is not None:
         report.write(out)
@@ -98,7 +98,7 @@ def assemble(
     verdict: Verdict,
     notes: list[str],
     rng: np.random.Generator,
-    flexible: float,
+    flexible: float | None,
 ) -> Report:
     """Everything that the report says; errors are those of the scene in its own steps."""
     best, base, sharp = verdict.best, setup.baseline, setup.problem.replayer

@@ -10,8 +10,9 @@ import numpy as np
 from mpc_sgft.diagnose import judge
 from mpc_sgft.diagnose.fit import STEP, Fit, fit, left_out_errors, robust, typical, weights, window_errors
 from mpc_sgft.diagnose.library import HIDDEN, Term, enrich, includes
-from mpc_sgft.diagnose.prepare import Setup
+from mpc_sgft.diagnose.prepare import ABOVE_NOISE, NOISE, Setup
 from mpc_sgft.diagnose.record import Array, Index
+from mpc_sgft.diagnose.table import INCLUDES
 
 INVISIBLE = 1e-4  # times the noise: an effect of typical size that changes less is no candidate
 SEEN = 1e-3  # a parameter whose derivative is smaller than this share of the largest changes nothing
@@ -23,17 +24,20 @@ class Effort(NamedTuple):
     Attributes:
         beam: Sets that are extended.
         full: Candidates that get a full fit: alone, as a second effect, as a third; twice as many get a quick one.
-        screen: Windows to screen on.
+        screen, sharpen: Windows for one step of each, and for quick fits.
         quick, last: Iterations of a quick fit, and of the full one that goes on from it.
-        enough: Pairs are tried although no effect alone gains, if the error is above this; never by default.
+        enough: Pairs are tried although no effect alone gains, if the error is above this.
+        pairs: Of those that the screened effects make, how many get a quick fit.
     """
 
     beam: int = 2
     full: tuple[int, ...] = (6, 3, 3)
-    screen: int = 10
+    screen: int = 6
+    sharpen: int = 10
     quick: int = 3
     last: int = 8
-    enough: float = np.inf
+    enough: float = NOISE + ABOVE_NOISE
+    pairs: int = 8
 
 
 class Entry(NamedTuple):
@@ -42,7 +46,7 @@ class Entry(NamedTuple):
     Attributes:
         fit: Nominal terms and effects.
         effects: Number of effects; they are the last terms.
-        errors: Error of every window when it is not fitted, [W fitted + W held].
+        errors: Error of every part of every window when that is not fitted, [(W fitted + W held) parts].
         complexity: Parameters of the effects that change anything.
     """
 
@@ -69,8 +73,12 @@ class Entry(NamedTuple):
 
     @property
     def idle(self) -> int:
-        """Parameters of the effects that change nothing here."""
-        return sum(len(t.size) for t in self.terms) - self.complexity
+        """Parameters that change nothing here, of effects that are there to do more than simpler ones."""
+        return (
+            sum(len(t.size) for t in self.terms) - self.complexity
+            if any(t.effect in INCLUDES for t in self.terms)
+            else 0
+        )
 
     @property
     def error(self) -> float:
@@ -83,10 +91,21 @@ class Proposal(NamedTuple):
     cost: float
 
 
+class Sample(NamedTuple):
+    """What one effect at one start does to the residuals of the nominal model: by how much it moves them [W, m], and
+    their derivatives by its parameters in typical sizes [W, m, p]."""
+
+    term: Term
+    start: Array
+    moved: Array
+    J: Array
+
+
 def entry(setup: Setup[Any], f: Fit) -> Entry:
     """Judge a fit on all windows: fitted ones by leaving out their block, the others as they are."""
     nominal = len(setup.baseline.terms)
-    errors = np.concatenate([left_out_errors(f, setup.blocks), window_errors(setup.problem, f, setup.held)])
+    left_out = left_out_errors(f, setup.blocks, setup.parts)
+    errors = np.concatenate([left_out, window_errors(setup.problem, f, setup.held, setup.parts)])
     errors = setup.judged(errors)
     norms = np.sqrt((f.J**2).sum((0, 1)))
     own = norms[sum(len(t.size) for t in f.terms[:nominal]) :]
@@ -113,24 +132,30 @@ def search(
         effort: How widely.
     """
     found = {frozenset(): entry(setup, setup.baseline)}
-    beam, best = list(found.values()), found[frozenset()]
+    beam, best, full, pairs = list(found.values()), found[frozenset()], 0, []
     for level in range(max_effects + 1):  # one more, in which simple effects may still be replaced by richer ones
         new: dict[frozenset[str], Entry] = {}
         for b, parent in enumerate(beam):
             report(f"{' + '.join(parent.names) or 'nominal'}", (level + b / len(beam)) / (max_effects + 1))
             full = effort.full[min(level, len(effort.full) - 1)]
-            ranked = screen(setup, parent, proposals(parent, terms, max_effects), effort.screen)
+            ranked, samples = screen(setup, parent, proposals(parent, terms, max_effects), effort.screen)
+            if not level:
+                pairs = couple(parent, samples, setup, effort) if max_effects > 1 and effort.pairs else []
             for proposal in sharpen(setup, ranked[: 2 * full], effort)[:full]:
-                key = frozenset(t.label + str(t.fixed) for t in proposal.terms[len(setup.baseline.terms) :])
+                key = key_of(setup, proposal.terms)
                 if key in found or key in new:
                     continue
                 f = fit(setup.problem, proposal.terms, proposal.start, setup.fitted, effort.last)
                 new[key] = entry(setup, f)
+        if level == 1:
+            for proposal in sharpen(setup, [p for p in pairs if key_of(setup, p.terms) not in new], effort)[:full]:
+                f = fit(setup.problem, proposal.terms, proposal.start, setup.fitted, effort.last)
+                new[key_of(setup, proposal.terms)] = entry(setup, f)
         found |= new
         if not new:
             break
         beam = sorted(new.values(), key=lambda e: e.error)[: effort.beam]
-        if judge.credible(best.errors, beam[0].errors, rng):
+        if judge.credible(best.errors, beam[0].errors, rng, setup.parts):
             best = beam[0]
         elif level or best.error <= effort.enough:
             break
@@ -166,13 +191,19 @@ def spread_starts(term: Term) -> list[Array]:
     return [np.where(some, term.neutral + share * (s - term.neutral), s) for share in (1.0, 0.1) for s in term.starts]
 
 
+def key_of(setup: Setup[Any], terms: Sequence[Term]) -> frozenset[str]:
+    """Of a set of effects, whatever their order."""
+    return frozenset(t.label + str(t.fixed) for t in terms[len(setup.baseline.terms) :])
+
+
 def screen(
     setup: Setup[Any], parent: Entry, options: list[tuple[tuple[Term, ...], list[Array], int]], windows: int
-) -> list[Proposal]:
-    """Order proposals by their error after one Gauss-Newton step, the best start of each set only."""
+) -> tuple[list[Proposal], list[Sample]]:
+    """Order proposals by their error after one Gauss-Newton step, the most promising start of each set only."""
     problem, pick, scale = setup.problem, _spread(setup.fitted, windows), typical(parent.fit.r)
     rows = np.searchsorted(setup.fitted, pick)
-    best: dict[frozenset[str], Proposal] = {}
+    best: dict[frozenset[str], tuple[float, Proposal, list[list[Array]]]] = {}
+    samples: list[Sample] = []
     for terms, start, new in options:
         term = terms[new]
         steps = [(-STEP if start[new][i] + STEP * s > term.high[i] else STEP) * s for i, s in enumerate(term.size)]
@@ -185,24 +216,74 @@ def screen(
         J_new = np.moveaxis((r[1:] - r[0]) * (term.size / np.array(steps))[:, None, None], 0, -1)
         if np.sqrt(np.mean(J_new**2)) < INVISIBLE:
             continue
+        samples.append(Sample(term, start[new], r[0] - parent.fit.r[rows], J_new))
         J_old = parent.fit.J[rows] if new == len(parent.fit.terms) else np.zeros((*r.shape[1:], 0))
         J = np.concatenate([J_old, J_new], -1)
         w = weights(r[0])
         A, g = np.einsum("w,wmp,wmq->pq", w, J, J, optimize=True), np.einsum("w,wmp,wm->p", w, J, r[0], optimize=True)
         A = A + np.diag(1e-3 * np.diag(A) + 1e-9 * max(float(np.diag(A).max()), 1e-30))
         step = -np.linalg.solve(A, g)
-        tries = [_moved(terms, start, new, step * share, J_old.shape[-1]) for share in (1.0, 0.3)]
-        costs = [float(robust(x, scale)) for x in (r[0], *problem.residuals(terms, tries, pick))]
-        i = int(np.argmin(costs))
+        here, there = float(robust(r[0], scale)), float(robust(r[0] + J @ step, scale))
         key = frozenset(t.label + str(t.fixed) for t in terms)
-        if key not in best or costs[i] < best[key].cost:
-            best[key] = Proposal(terms, tuple([start, *tries][i]), float(costs[i]))
-    return sorted(best.values(), key=lambda p: p.cost)
+        if key not in best or there < best[key][0]:
+            tries = [_moved(terms, start, new, step * share, J_old.shape[-1]) for share in (1.0, 0.3)]
+            best[key] = there, Proposal(terms, tuple(start), here), tries
+    out: list[Proposal] = []
+    for _, proposal, tries in best.values():
+        costs = robust(problem.residuals(proposal.terms, tries, pick), scale)
+        reached = [Proposal(proposal.terms, tuple(t), float(c)) for t, c in zip(tries, costs, strict=True)]
+        out.append(min([proposal, *reached], key=lambda p: p.cost))
+    return sorted(out, key=lambda p: p.cost), samples
+
+
+def couple(parent: Entry, samples: list[Sample], setup: Setup[Any], effort: Effort) -> list[Proposal]:
+    """Pairs of effects that together may do what neither does alone, judged by what each does to the residuals.
+
+    The residuals of two effects are taken for the nominal model's, moved by the one and by the other: no simulation.
+    """
+    rows = np.searchsorted(setup.fitted, _spread(setup.fitted, effort.screen))
+    r0, J0 = parent.fit.r[rows], parent.fit.J[rows]
+    root = np.sqrt(weights(r0))[:, None, None]
+    parts = [r0[..., None], J0, *(x for s in samples for x in (s.moved[..., None], s.J))]
+    columns = (np.concatenate(parts, -1) * root).reshape(r0.size, -1)
+    gram = columns.T @ columns
+    ends = np.cumsum([p.shape[-1] for p in parts])
+    nominal = np.arange(1, ends[1])
+    best: dict[frozenset[str], Proposal] = {}
+    for j, second in enumerate(samples):
+        for i, first in enumerate(samples[:j]):
+            if first.term.label == second.term.label or _overlap(first.term, second.term):
+                continue
+            own = [np.arange(ends[2 * k + 2], ends[2 * k + 3]) for k in (i, j)]
+            free = np.concatenate([nominal, *own])
+            fixed = [0, ends[2 * i + 1], ends[2 * j + 1]]  # the nominal residuals, and how either effect moves them
+            A, g = gram[np.ix_(free, free)], gram[np.ix_(free, fixed)].sum(1)
+            step = -np.linalg.solve(A + np.diag(1e-3 * np.diag(A) + 1e-12), g)
+            start, done = list(parent.fit.values), 0
+            for term, value in zip(
+                [*parent.fit.terms, first.term, second.term], [*start, first.start, second.start], strict=True
+            ):
+                size = slice(done, done + len(value))
+                step[size] = (np.clip(value + step[size] * term.size, term.low, term.high) - value) / term.size
+                done += len(value)
+            cost = float(gram[np.ix_(fixed, fixed)].sum() + 2 * g @ step + step @ A @ step)
+            terms = (*parent.fit.terms, first.term, second.term)
+            key = key_of(setup, terms)
+            if key not in best or cost < best[key].cost:
+                values = [*parent.fit.values, first.start, second.start]
+                cuts = np.split(step, np.cumsum([len(v) for v in values])[:-1])
+                moved = [v + s * t.size for v, s, t in zip(values, cuts, terms, strict=True)]
+                best[key] = Proposal(terms, tuple(moved), cost)
+    return sorted(best.values(), key=lambda p: p.cost)[: effort.pairs]
+
+
+def _overlap(a: Term, b: Term) -> bool:
+    return includes(a, b) or includes(b, a)
 
 
 def sharpen(setup: Setup[Any], ranked: list[Proposal], effort: Effort) -> list[Proposal]:
     """Order proposals anew after a few iterations on some windows: one step says little of some effects."""
-    pick, out = _spread(setup.fitted, effort.screen), []
+    pick, out = _spread(setup.fitted, effort.sharpen), []
     scale = typical(setup.baseline.r)
     for p in ranked:
         f = fit(setup.problem, p.terms, p.start, pick, effort.quick)

@@ -19,7 +19,8 @@ class Smooth(NamedTuple):
     Attributes:
         q, v, a: Position, velocity and acceleration at the samples.
         noise: Standard deviation of the position noise.
-        q_sd, v_sd: How uncertain q and v are.
+        q_sd, v_sd: How uncertain q and v are, but for the ends.
+        half: Samples at either end of the episode where they are more uncertain, a number.
     """
 
     q: Array
@@ -28,6 +29,7 @@ class Smooth(NamedTuple):
     noise: Array
     q_sd: Array
     v_sd: Array
+    half: int
 
 
 def noise_of(x: Array) -> float:
@@ -48,8 +50,8 @@ def noise_of(x: Array) -> float:
 def smooth(episode: Episode, joints: Sequence[str]) -> Smooth:
     """Smooth every joint of an episode; measured velocities are used where they are better than derived ones."""
     columns = [_one(episode.signals[f"qpos/{j}"], episode.signals.get(f"qvel/{j}"), episode.dt) for j in joints]
-    q, v, a, noise, q_sd, v_sd = (np.stack(parts, -1) for parts in zip(*columns, strict=True))
-    return Smooth(q, v, a, noise, q_sd, v_sd)
+    q, v, a, noise, q_sd, v_sd, half = (np.stack(parts, -1) for parts in zip(*columns, strict=True))
+    return Smooth(q, v, a, noise, q_sd, v_sd, int(half.max()))
 
 
 def _one(q: Array, measured_v: Array | None, dt: float) -> tuple[Array, ...]:
@@ -76,4 +78,4 @@ def _one(q: Array, measured_v: Array | None, dt: float) -> tuple[Array, ...]:
         lag = float(np.clip(np.sum((v - measured_v) * a) / max(np.sum(a * a), 1e-30), -dt, dt))
         if own < error:
             v, error = measured_v + lag * a, own
-    return level, v, a, np.array(noise), np.array(q_sd), np.array(error)
+    return level, v, a, np.array(noise), np.array(q_sd), np.array(error), np.array(width // 2)

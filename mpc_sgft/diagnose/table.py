@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 
@@ -34,6 +34,7 @@ class Row(NamedTuple):
     parameters: Mapping[str, Par]
     driven: bool = False  # only where a motor sits
     sums: Mapping[str, tuple[str, str]] = {}  # the effect's parameter -> fitted ones that it is the sum of
+    variants: Sequence[Mapping[str, float]] = ({},)  # parameters that are held, one candidate each
 
 
 _force, _viscous = (lambda s: s.force), (lambda s: s.force / s.speed)
@@ -61,7 +62,7 @@ TABLE: dict[str, Row] = {
     ),
     "armature": Row({"inertia": Par(0.0, lambda s: s.inertia)}),
     "backlash": Row({"gap": Par(0.0, lambda s: 0.1 * s.travel, (0.03, 0.3), 0.0, 10.0)}, driven=True),
-    "gravity_tilt": Row({"angle": _tilt, "roll": _tilt}),
+    "gravity_tilt": Row({"angle": _tilt, "roll": _tilt}, variants=({"roll": 0.0}, {"angle": 0.0}, {})),
     "payload": Row({"mass": Par(0.0, lambda s: s.mass, (0.2,))}),
     "actuator_gain": Row({"gain": Par(1.0, lambda s: 1.0, (-0.1, 0.1), -0.95, 2.0)}),
     "actuator_offset": Row({"offset": Par(0.0, lambda s: s.command, (0.05, -0.05))}),
