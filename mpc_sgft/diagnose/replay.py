@@ -7,6 +7,7 @@ step gets the mean of the command over the half steps around it. This makes the 
 from __future__ import annotations
 
 import copy
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -24,6 +25,7 @@ from mpc_sgft.diagnose.smooth import smooth
 FULL = mujoco.mjtState.mjSTATE_FULLPHYSICS
 CTRL = int(mujoco.mjtState.mjSTATE_CTRL)
 FORCED = CTRL | int(mujoco.mjtState.mjSTATE_QFRC_APPLIED)
+THREADS = int(os.environ.get("OMP_NUM_THREADS", len(os.sched_getaffinity(0))))
 LEVEL = 1e-3  # [s] between two settings of a friction that follows the load
 EXPLODED = 1e6  # predictions are clipped here, so that an unstable candidate is bad, not infinite
 
@@ -158,7 +160,8 @@ class Replayer:
             states, sensed = self._rub(models, changes, starts, driven, control)
         else:
             each = [x for x in models for _ in range(count)]
-            states, sensed = mujoco.rollout.rollout(each, data, starts, driven, control_spec=control)
+            workers = [mujoco.MjData(m) for _ in range(THREADS)]
+            states, sensed = mujoco.rollout.rollout(each, workers, starts, driven, control_spec=control)
         states, sensed = np.asarray(states, float), np.asarray(sensed, float)
         shape = (len(models), count, self.steps)
         qpos = np.concatenate([state[:, :, None, 1 + qadr], states[..., 1 + qadr].reshape(*shape, nj)], 2)

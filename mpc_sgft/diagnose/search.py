@@ -74,11 +74,8 @@ class Entry(NamedTuple):
     @property
     def idle(self) -> int:
         """Parameters that change nothing here, of effects that are there to do more than simpler ones."""
-        return (
-            sum(len(t.size) for t in self.terms) - self.complexity
-            if any(t.effect in INCLUDES for t in self.terms)
-            else 0
-        )
+        rich = any(t.effect in INCLUDES for t in self.terms)
+        return sum(len(t.size) for t in self.terms) - self.complexity if rich else 0
 
     @property
     def error(self) -> float:

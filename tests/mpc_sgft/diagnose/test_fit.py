@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from mpc_sgft.diagnose import judge
-from mpc_sgft.diagnose.fit import fit, left_out_errors
+from mpc_sgft.diagnose.fit import by_parts, fit, left_out_errors
 from mpc_sgft.diagnose.library import Term
 from mpc_sgft.diagnose.plant import Change
 
@@ -55,3 +55,16 @@ def test_a_gain_in_a_few_windows_is_credible_and_one_in_a_single_window_is_not()
     few[:8], one[0] = -1.0, -8.0
     assert judge.credible(before, few, rng) and not judge.credible(before, one, rng)
     assert not judge.credible(before, before - 0.01, rng)  # real, and too small for a name
+
+
+def test_a_gain_in_all_parts_of_one_window_is_not_credible() -> None:
+    rng = np.random.default_rng(0)
+    before, one, two = np.zeros(24), np.zeros(24), np.zeros(24)
+    one[:6], two[3:9] = -1.0, -1.0  # windows of six parts
+    assert judge.credible(before, two, rng, parts=6) and not judge.credible(before, one, rng, parts=6)
+
+
+def test_parts_by_hand() -> None:
+    squares = np.array([[1.0, 3.0, 5.0, 7.0, 9.0], [0.0, 0.0, 1.0, 1.0, 1.0]])
+    np.testing.assert_allclose(by_parts(squares, 2), [2.0, 7.0, 0.0, 1.0])
+    np.testing.assert_allclose(by_parts(squares, 1), squares.mean(1))

@@ -129,3 +129,33 @@ def test_a_richer_effect_starts_as_the_simpler_one(plant) -> None:
         old, new = (make_term(plant, n, "x", Scales()) for n in (simple, rich))
         a, b = replayer.simulate([old.build(np.array([value])), new.build(enrich(new, old, np.array([value])))])
         np.testing.assert_allclose(a, b, atol=1e-7)
+
+
+def test_friction_follows_the_load_of_the_simulation_and_not_of_the_recording(plant) -> None:
+    """m q'' = F - c |F| sign(q') from rest, F = 4 and then -4: by hand a1 = (1 - c) F / m, a2 = (1 + c) F / m."""
+    m, c, turn = 2.0, 0.25, 0.2
+    t = np.arange(250) * 0.001
+    ctrl = np.where(t < turn, 4.0, -4.0)
+    still = Episode("still", 0.001, ctrl[:, None], {"qpos/x": 1e-3 * np.sin(50 * t)})  # a motion of its own
+    replayer = Replayer(plant.sharper(), [still], 0.24, ["qpos/x"])
+    begin = replayer.windows.start[0] * 0.001
+    a1, a2 = (1 - c) * 4 / m, -(1 + c) * 4 / m
+    replayer.windows = replayer.windows._replace(q0=np.zeros((1, 1)), v0=np.zeros((1, 1)), a0=np.full((1, 1), a1))
+    rub = make_term(plant, "load_dependent_friction", "x", Scales()).build(np.array([c]))
+    after = 0.001 * np.arange(1, replayer.windows.samples + 1)
+    up, late = turn - begin, np.maximum(after - (turn - begin), 0)
+    truth = np.where(after < up, a1 * after**2 / 2, a1 * up**2 / 2 + a1 * up * late + a2 * late**2 / 2)
+    assert late[-1] < -a1 * up / a2  # it has not turned round yet
+    np.testing.assert_allclose(replayer.simulate([rub])[0, 0, :, 0], truth, atol=2e-5)
+
+
+def test_no_window_starts_where_smoothing_knows_one_side_only(plant) -> None:
+    rng = np.random.default_rng(0)
+    t = np.arange(1000) * 0.002
+    apart = []
+    for k in range(20):
+        q = 0.1 * np.sin(15 * t + k) + 1e-3 * rng.standard_normal(len(t))
+        replayer = Replayer(plant, [Episode(f"{k}", 0.002, np.zeros((1000, 1)), {"qpos/x": q})], 0.45, ["qpos/x"])
+        true = 1.5 * np.cos(15 * t[replayer.windows.start] + k)
+        apart += list((replayer.windows.v0[:, 0] - true) / replayer.smooth[0].v_sd[0])
+    assert np.abs(apart).max() < 4  # at the very end it is up to 13

@@ -1,0 +1,64 @@
+"""The search over sets, on a problem made by hand: residuals are linear in each effect's parameter."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+
+from mpc_sgft.diagnose.fit import fit
+from mpc_sgft.diagnose.library import Term, candidates, settings
+from mpc_sgft.diagnose.plant import Change, Plant
+from mpc_sgft.diagnose.prepare import NOISE, Setup
+from mpc_sgft.diagnose.search import Effort, search
+from mpc_sgft.diagnose.table import Scales
+
+PENDULUM = """<mujoco><worldbody><body><joint name="hinge" axis="0 1 0"/><geom size="0.05" pos="0 0 -0.4" mass="1"/>
+</body></worldbody><actuator><motor name="motor" joint="hinge"/></actuator></mujoco>"""
+
+
+def term(name: str) -> Term:
+    one = np.ones(1)
+    return Term(name, (), ("a",), ("1",), 0 * one, -50 * one, 50 * one, one, (0.5 * one,), lambda x: Change())
+
+
+class Lines:
+    """r = y - sum of a_i x_i over the effects; y is the difference of two columns that are nearly the same."""
+
+    blocks = 40
+
+    def __init__(self) -> None:
+        rng = np.random.default_rng(1)
+        shared = rng.normal(size=(24, 40))
+        self.columns = {name: rng.normal(size=shared.shape) for name in "abcdefgh"}
+        self.columns |= {name: shared + 0.1 * rng.normal(size=shared.shape) for name in "xy"}
+        self.y = 30 * (self.columns["x"] - self.columns["y"]) + rng.normal(size=shared.shape)
+        self.columns["a"] += 0.1 * self.y  # looks best alone
+
+    def residuals(self, terms: Sequence[Term], points: Sequence[Sequence[np.ndarray]], pick: np.ndarray) -> np.ndarray:
+        def one(values: Sequence[np.ndarray]) -> np.ndarray:
+            return sum((v[0] * self.columns[t.effect] for t, v in zip(terms, values, strict=True)), -self.y)[pick]
+
+        return np.stack([one(p) for p in points])
+
+
+def found(pairs: int) -> list[set[str]]:
+    problem, fitted = Lines(), np.arange(18)
+    base = fit(problem, [], [], fitted)
+    none = np.zeros(1)
+    setup = Setup(problem, fitted, np.arange(18, 24), fitted // 3, base, none, none, np.log1p, NOISE)
+    terms = [term(name) for name in "abcdefghxy"]
+    entries = search(setup, terms, 2, np.random.default_rng(0), effort=Effort(beam=1, full=(1, 1, 1), pairs=pairs))
+    return [set(e.names) for e in entries if e.error < NOISE + 0.1]
+
+
+def test_two_effects_that_nearly_cancel_are_found_together() -> None:
+    assert found(pairs=4) == [{"x", "y"}]
+
+
+def test_gravity_may_turn_about_one_axis_or_both() -> None:
+    plant = Plant(mujoco.MjSpec.from_string(PENDULUM))
+    tilts = candidates(plant, {"": Scales()}, ["gravity_tilt"])
+    assert [t.names for t in tilts] == [("angle",), ("roll",), ("angle", "roll")]
+    assert settings(tilts[0], np.array([0.1])) == {"angle": 0.1, "roll": 0.0}
