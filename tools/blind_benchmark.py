@@ -1,7 +1,8 @@
 """The blind benchmark of `diagnose`: make cases from a seed, hide the labels, run, score, draw.
 
     python -m tools.blind_benchmark --seed 20261 --cases 300 --out runs/blind [--jobs 2] [--csv results/blind.csv]
-                                    [--only generate|run|score] [--least-none 100] [--no-oracle] [--no-baselines]
+                                    [--only generate|run|score] [--least-none 100] [--fr3 30] [--no-oracle]
+                                    [--no-baselines]
 
 The labels' SHA-256 is printed before the solver starts, and checked before scoring. A seed that was used to tune the
 solver must not be reported: 11, 901 and 902 so far. Everything is resumable: what is on disk is not done again. The
@@ -20,7 +21,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from tools.blind import baselines, cases, score
+from tools.blind import baselines, cases, fr3_draw, fr3_make, score
 from tools.blind.draw import draw
 from tools.blind.make import make
 from tools.blind.plots import draw as draw_plots
@@ -29,23 +30,25 @@ from tools.blind.solve import reports, solve_all
 STEPS = ("generate", "run", "score")
 
 
-def generate(out: Path, seed: int, count: int, least_none: int) -> str:
-    """Cases and labels on disk; the labels' hash. Nothing is made anew if they are there.
+def generate(out: Path, seed: int, count: int, least_none: int, arms: int = 0) -> str:
+    """Cases and labels on disk, `arms` of the FR3 last; the labels' hash. Nothing is made anew if they are there.
 
     Raises:
         ValueError: If the folder holds cases of another seed or another number of them.
     """
     drawn = draw(seed, count, least_none)
+    extra = fr3_draw.draw(seed, arms, len(drawn))
+    total = len(drawn) + len(extra)
     if (out / "labels.sha256").is_file():
         there = cases.labels(out)
-        if cases.seed_of(out) != seed or len(there) != len(drawn):
+        if cases.seed_of(out) != seed or len(there) != total:
             raise ValueError(
-                f"{out} holds {len(there)} cases of seed {cases.seed_of(out)}, not {len(drawn)} of seed {seed}. "
+                f"{out} holds {len(there)} cases of seed {cases.seed_of(out)}, not {total} of seed {seed}. "
                 "Give another --out, or delete that folder."
             )
         return (out / "labels.sha256").read_text().strip()
-    with tqdm(total=len(drawn), desc="generate", unit="case") as bar:
-        return cases.write(out, make(drawn, bar.update), seed)
+    with tqdm(total=total, desc="generate", unit="case") as bar:
+        return cases.write(out, make(drawn, bar.update) + fr3_make.make(extra, bar.update), seed)
 
 
 def run(out: Path, jobs: int) -> None:
@@ -135,6 +138,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--seed", type=int, required=True, help="of the cases; a fresh one for what is reported")
     parser.add_argument("--cases", type=int, default=300, help="how many (default 300)")
     parser.add_argument("--least-none", type=int, default=0, help="add cases without effect until there are so many")
+    parser.add_argument("--fr3", type=int, default=0, help="so many cases of the FR3 beside the others (default 0)")
     parser.add_argument("--out", type=Path, required=True, help="folder for cases, labels and reports")
     parser.add_argument("--jobs", type=int, default=2, help="processes (default 2)")
     parser.add_argument("--only", choices=STEPS, help="one step (default: all)")
@@ -146,7 +150,7 @@ def main(argv: list[str]) -> int:
     steps = (args.only,) if args.only else STEPS
     try:
         if "generate" in steps:
-            generate(args.out, args.seed, args.cases, args.least_none)
+            generate(args.out, args.seed, args.cases, args.least_none, args.fr3)
         cases.labels(args.out)
         if cases.seed_of(args.out) != args.seed:
             raise ValueError(f"{args.out} holds cases of seed {cases.seed_of(args.out)}, not of {args.seed}")

@@ -10,6 +10,10 @@
 | loop.py      | controller, drive, plant and encoder in closed loop, or the plant driven by recorded commands |
 | library.py   | every effect: where it can sit, how large it may be, what parameters the solver should report |
 | detect.py    | the size at which an effect becomes detectable                                                |
+| fr3.py       | the FR3 in MuJoCo with other numerics, and callbacks for what the model lacks                 |
+| fr3_friction.py | dry friction of its joints by events                                                       |
+| fr3_draw.py  | which cases of the FR3 there are                                                              |
+| fr3_make.py  | their data                                                                                    |
 | draw.py      | which cases there are, from a seed                                                            |
 | cases.py     | folders of cases, labels apart from them, the hash of the labels                              |
 | solve.py     | runs `diagnose` on the folders                                                                |

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from tools.blind import fr3
 from tools.blind.library import equivalents, place
 from tools.blind.make import Made
 from tools.blind.mjcf import build
@@ -33,7 +34,8 @@ def write(out: Path, made: list[Made], seed: int) -> str:
     for one in made:
         folder = out / "cases" / one.case.name
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / "model.xml").write_text(build(PLANTS[one.case.plant], one.case.nominal))
+        text = fr3.build() if one.case.plant == "fr3" else build(PLANTS[one.case.plant], one.case.nominal)
+        (folder / "model.xml").write_text(text)
         (folder / "known.json").write_text(json.dumps({"uncertain": one.case.uncertain}))
         for i, columns in enumerate(one.episodes):
             table = np.column_stack(list(columns.values()))
@@ -48,7 +50,8 @@ def write(out: Path, made: list[Made], seed: int) -> str:
 
 def label(made: Made) -> dict[str, Any]:
     """All that is hidden about a case, and what scores are split by."""
-    case, plant = made.case, PLANTS[made.case.plant]
+    case = made.case
+    plant = fr3.Arm() if case.plant == "fr3" else PLANTS[case.plant]
     names = tuple(t["name"] for t in made.truth)
     effects = [{**t, "at": place(plant, t["name"], t["joint"])} for t in made.truth]
     return {

@@ -121,15 +121,15 @@ def _case(index: int, group: str, rank: int, seed: int, attempt: int = 0) -> Cas
     force = bool(rng.uniform() < 0.3)
     if group == "single":
         options = sorted(SITES[name])
-        effects = (_given(options[int(rng.integers(len(options)))], SITES[name], rng, MULTIPLE),)
+        effects = (given(options[int(rng.integers(len(options)))], SITES[name], rng, MULTIPLE),)
         force |= effects[0].name in ("actuator_delay", "sensor_delay", "actuator_offset")
     elif group == "pair":
-        first, second = _pair(name, rng)
-        effects = tuple(_given(n, SITES[name], rng, (1.5, MULTIPLE[1])) for n in (first, second))
+        first, second = pair(name, rng)
+        effects = tuple(given(n, SITES[name], rng, (1.5, MULTIPLE[1])) for n in (first, second))
         force |= bool({"actuator_delay", "sensor_delay"} & {first, second})
     elif group == "outside":
         options = sorted(OUTSIDE_SITES[name])
-        effects = (_given(options[rank % len(options)], OUTSIDE_SITES[name], rng, (3.0, MULTIPLE[1])),)
+        effects = (given(options[rank % len(options)], OUTSIDE_SITES[name], rng, (3.0, MULTIPLE[1])),)
     elif group == "ambiguous":
         kind = ("equivalent", "one_speed", "short")[rank % 3]
         name, effects, seconds = _ambiguous(kind, name, seconds, rng)
@@ -164,7 +164,7 @@ def _case(index: int, group: str, rank: int, seed: int, attempt: int = 0) -> Cas
     )
 
 
-def _given(
+def given(
     name: str, sites: dict[str, tuple[int, ...]], rng: np.random.Generator, multiples: tuple[float, float]
 ) -> Given:
     joint = int(rng.choice(sites[name]))
@@ -172,7 +172,7 @@ def _given(
     return Given(name, joint, multiple, {k: float(rng.uniform()) for k in ("sign", "ratio", "speed")})
 
 
-def _pair(plant: str, rng: np.random.Generator) -> tuple[str, str]:
+def pair(plant: str, rng: np.random.Generator) -> tuple[str, str]:
     """Two effects that leave different traces."""
     options = sorted(SITES[plant])
     while True:
@@ -188,12 +188,12 @@ def _ambiguous(kind: str, plant: str, seconds: float, rng: np.random.Generator) 
         options = [("slide", n) for n in ("payload", "armature", "gravity_tilt", "actuator_offset", "actuator_delay")]
         options += [("slide", "sensor_delay"), ("pendulum", "actuator_delay"), ("pendulum", "sensor_delay")]
         plant, effect = options[int(rng.integers(len(options)))]
-        return plant, (_given(effect, {effect: (0,)}, rng, (2.0, 10.0)),), seconds
+        return plant, (given(effect, {effect: (0,)}, rng, (2.0, 10.0)),), seconds
     if kind == "one_speed":
         effect = str(rng.choice(["viscous_friction", "coulomb_friction", "actuator_offset", "quadratic_drag"]))
-        return "slide", (_given(effect, {effect: (0,)}, rng, (2.0, 10.0)),), min(seconds, 8.0)
+        return "slide", (given(effect, {effect: (0,)}, rng, (2.0, 10.0)),), min(seconds, 8.0)
     options = sorted(set(SITES[plant]) & set(LIBRARY))
-    return plant, (_given(options[int(rng.integers(len(options)))], SITES[plant], rng, (0.5, 2.0)),), 0.6
+    return plant, (given(options[int(rng.integers(len(options)))], SITES[plant], rng, (0.5, 2.0)),), 0.6
 
 
 def _wrong(plant: Plant, rng: np.random.Generator) -> dict[str, float]:

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tools.blind.plants import PLANTS, Array, Plant
+from tools.blind.plants import PLANTS, Array, Machine
 
 Scales = Mapping[str, float]
 Shape = Mapping[str, float]
@@ -233,6 +233,11 @@ SITES: dict[str, dict[str, tuple[int, ...]]] = {
 OUTSIDE_SITES: dict[str, dict[str, tuple[int, ...]]] = {
     name: {effect: ((0, 1) if name == "arm" else (0,)) for effect in OUTSIDE} for name in PLANTS
 }
+_EVERY = tuple(range(7))
+SITES["fr3"] = {name: _EVERY for name in ("viscous_friction", "coulomb_friction", "asymmetric_friction")}
+SITES["fr3"] |= {name: _EVERY for name in ("actuator_gain", "actuator_offset", "actuator_delay", "sensor_offset")}
+SITES["fr3"] |= {"payload": (6,), "armature": _EVERY, "joint_stiffness": _EVERY}
+OUTSIDE_SITES["fr3"] = {name: _EVERY for name in ("cogging", "position_dependent_friction")}
 
 
 def equivalents(plant: str, effects: tuple[str, ...], force_measured: bool) -> list[list[str]]:
@@ -241,8 +246,13 @@ def equivalents(plant: str, effects: tuple[str, ...], force_measured: bool) -> l
     On one joint without gravity a tilt and an offset of the command are the same constant force, and a payload is an
     armature. With one actuator a delay of the command is a delay of everything that is measured. The measured force of
     the drive tells apart what the command does from what comes after. On the cart an armature is a heavier cart.
+    On the FR3, whose weight is compensated, an encoder that reads too much, or by a factor, shows what a servo does
+    whose command is shifted or scaled, but for what a milliradian changes of the arm's inertia.
     """
     swaps: dict[str, list[str]] = {"cartpole": {"armature": ["payload"]}}.get(plant, {})
+    if plant == "fr3":
+        swaps = {"actuator_offset": ["sensor_offset"], "sensor_offset": ["actuator_offset"]}
+        swaps |= {"actuator_gain": ["sensor_gain"]}
     if plant == "slide":
         swaps = {"payload": ["armature"], "armature": ["payload"]}
         if not force_measured:
@@ -257,7 +267,7 @@ def equivalents(plant: str, effects: tuple[str, ...], force_measured: bool) -> l
     ]
 
 
-def place(plant: Plant, effect: str, joint: int) -> list[str]:
+def place(plant: Machine, effect: str, joint: int) -> list[str]:
     """Names of the elements at which an effect sits, [] for the whole scene."""
     sits = EVERYTHING[effect].sits
     if sits == "scene":

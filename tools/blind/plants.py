@@ -10,7 +10,7 @@ by `tilt` [rad] about the horizontal axis, so that a body of mass m feels m g (s
 """
 
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,19 @@ from numpy.typing import NDArray
 Array = NDArray[Any]
 Rows = Mapping[str, Array]
 G = 9.81  # [m/s^2]
+
+
+class Machine(Protocol):
+    """What the parts of any machine are called."""
+
+    @property
+    def joints(self) -> tuple[str, ...]: ...
+    @property
+    def actuators(self) -> tuple[str, ...]: ...
+    @property
+    def tip(self) -> str: ...
+    @property
+    def n(self) -> int: ...
 
 
 class Plant(NamedTuple):

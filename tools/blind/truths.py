@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from tools.blind.plants import Array, Plant, Rows
+from tools.blind.plants import Array, Machine, Plant, Rows
 
 # per joint ------------------------------------------------------------------------------------------------------------
 PER_JOINT: dict[str, float] = {
@@ -64,7 +64,7 @@ PER_ROW: dict[str, float] = {
 }
 
 
-def rows(plant: Plant, numbers: Mapping[str, Any], count: int = 1) -> dict[str, Array]:
+def rows(plant: Machine, numbers: Mapping[str, Any], count: int = 1) -> dict[str, Array]:
     """`count` machines with these nominal parameters (see mjcf.RANGES) and no effect."""
     made = {k: np.full((count, plant.n), v) for k, v in PER_JOINT.items()}
     made |= {k: np.full(count, v) for k, v in PER_ROW.items()}
