@@ -23,6 +23,7 @@ MIN_WINDOWS = 4  # shorter windows rather than fewer
 UNITS = 24  # parts of windows to compare sets on, at least
 BLOCKS = 8  # into which the fitted windows are split for leaving out
 NOISE = float(np.log(2.0))  # log(1 + e) of a window whose error is noise alone, e = 1
+QUIET = 0.1  # in log(1 + e): below this above the noise's, no further effect is searched for
 ABOVE_NOISE = 0.25  # in log(1 + e): an error that is no more above the noise's needs no further name
 KICK = 1e-4  # of the typical size, to differentiate by the start
 
@@ -104,7 +105,7 @@ def prepare(
     def judged(errors: Array) -> Array:
         return np.log1p(np.maximum(errors, least))
 
-    return Setup(problem, fitted, held, blocks, base, noise, np.median(floor[0], (0, 1)), judged, NOISE, parts)
+    return Setup(problem, fitted, held, blocks, base, noise, np.median(floor[0], (0, 1)), judged, NOISE + QUIET, parts)
 
 
 def split(replayer: Any, held_out: float | Sequence[str] | None) -> tuple[Index, Index]:

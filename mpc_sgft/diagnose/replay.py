@@ -26,7 +26,6 @@ FULL = mujoco.mjtState.mjSTATE_FULLPHYSICS
 CTRL = int(mujoco.mjtState.mjSTATE_CTRL)
 FORCED = CTRL | int(mujoco.mjtState.mjSTATE_QFRC_APPLIED)
 THREADS = int(os.environ.get("OMP_NUM_THREADS", len(os.sched_getaffinity(0))))
-LEVEL = 1e-3  # [s] between two settings of a friction that follows the load
 EXPLODED = 1e6  # predictions are clipped here, so that an unstable candidate is bad, not infinite
 
 
@@ -48,6 +47,39 @@ class Windows(NamedTuple):
     q0: Array
     v0: Array
     a0: Array
+
+
+class Drive(NamedTuple):
+    """An actuator at a joint: what its force becomes when its command changes at once.
+
+    Attributes:
+        joint: Index of its joint.
+        sensor, ctrl: Where its force and its command are.
+        gear, gain: Force of the joint per force of the actuator, and that per command.
+        low, high: Limits of the actuator's force.
+    """
+
+    joint: int
+    sensor: int
+    ctrl: int
+    gear: float
+    gain: float
+    low: float
+    high: float
+
+    @classmethod
+    def of(cls, m: mujoco.MjModel, name: str, joint: int) -> Drive:
+        a = m.actuator(name)
+        limits = m.actuator_forcerange[a.id] if m.actuator_forcelimited[a.id] else (-np.inf, np.inf)
+        direct = m.actuator_dyntype[a.id] == mujoco.mjtDyn.mjDYN_NONE
+        gain = float(a.gainprm[0]) if direct and m.actuator_gaintype[a.id] == mujoco.mjtGain.mjGAIN_FIXED else 0.0
+        at = int(m.sensor(f"{FORCE}{name}").adr[0])
+        return cls(joint, at, int(a.id), float(a.gear[0]), gain, float(limits[0]), float(limits[1]))
+
+    def load(self, felt: Array, then: Array, now: Array) -> Array:
+        """Force on the joint under the commands `now`, from sensors read under the commands `then`, [R]."""
+        change = self.gain * (now[:, self.ctrl] - then[:, self.ctrl])
+        return self.gear * np.clip(felt[:, self.sensor] + change, self.low, self.high)
 
 
 class Replayer:
@@ -240,7 +272,7 @@ class Replayer:
         inputs: Array,
         control: int,
     ) -> tuple[Array, Array]:
-        """States and sensors where dry friction follows the actuators' load; the level is set every LEVEL seconds.
+        """States and sensors where dry friction follows the actuators' load; its level is set anew for each sample.
 
         Args:
             models: One each change, [K].
@@ -249,38 +281,48 @@ class Replayer:
             inputs: Of every step, [K W, N, …].
             control: What the inputs are.
         """
-        each = len(state) // len(models)
+        each, count, m = len(state) // len(models), inputs.shape[1], models[0]
         own = [copy.copy(m) for m in models for _ in range(each)]
-        m, data = models[0], mujoco.MjData(models[0])
+        data, roll = [mujoco.MjData(m)], mujoco.rollout.Rollout()
         _, vadr = self.plant.addresses(m)
         losses = [x.dof_frictionloss for x in own]
-        before = np.array(losses)[:, vadr]
-        drives = [(i, m.actuator(a), joint_of(self.plant, a)) for i, a in enumerate(self.plant.actuators)]
-        drives = [(int(m.sensor(f"{FORCE}{a.name}").adr[0]), a.gear[0], j) for _, a, j in drives if j]
+        before, still = np.array(losses)[:, vadr], np.zeros((len(own), len(vadr)))
+        drives = [
+            Drive.of(m, a, self.plant.joints.index(j)) for a in self.plant.actuators if (j := joint_of(self.plant, a))
+        ]
+        states = np.empty((len(own), count, state.shape[1]))
+        sensed = np.empty((len(own), count, m.nsensordata))
 
-        def set_levels(sensed: Array) -> None:
-            load = np.zeros(before.shape)
-            for at, gear, joint in drives:
-                load[:, self.plant.joints.index(joint)] += gear * sensed[:, at]
-            level = before.copy()
+        def advance(begin: int, end: int) -> None:
+            out = np.empty((len(own), end - begin, state.shape[1])), np.empty((len(own), end - begin, m.nsensordata))
+            first = np.ascontiguousarray(state if not begin else states[:, begin - 1])
+            given = np.ascontiguousarray(inputs[:, begin:end])
+            roll.rollout(
+                own, data, first, given,
+                control_spec=control, skip_checks=True, nstep=end - begin, state=out[0], sensordata=out[1],
+            )  # fmt: skip
+            states[:, begin:end], sensed[:, begin:end] = out
+
+        def set_levels(felt: Array, then: Array, now: Array) -> None:
+            load = still.copy()
+            for d in drives:
+                load[:, d.joint] += d.load(felt, then, now)
             for k, change in enumerate(changes):
                 mine = slice(k * each, (k + 1) * each)
-                level[mine] += sum((f(load[mine]) for f in change.frictions), np.zeros_like(load[mine]))
-            for loss, row in zip(losses, level, strict=True):
-                loss[vadr] = row
+                level = before[mine] + sum((f(load[mine]) for f in change.frictions), still[mine])
+                for loss, row in zip(losses[mine], level, strict=True):
+                    loss[vadr] = row
 
-        def steps(inputs: Array) -> tuple[Array, Array]:
-            done = mujoco.rollout.rollout(own, data, state, inputs, control_spec=control)
-            return np.asarray(done[0], float), np.asarray(done[1], float)
-
-        set_levels(steps(inputs[:, :1])[1][:, 0])
-        block = max(1, round(LEVEL / self.h))
-        parts = []
-        for begin in range(0, inputs.shape[1], block):
-            parts.append(steps(inputs[:, begin : begin + block]))
-            state = parts[-1][0][:, -1]
-            set_levels(parts[-1][1][:, -1])
-        return np.concatenate([p[0] for p in parts], 1), np.concatenate([p[1] for p in parts], 1)
+        block = max(1, round(self.dt / self.h))
+        advance(0, 1)  # only to feel the load at the start
+        set_levels(sensed[:, 0], inputs[:, 0], inputs[:, 0])
+        for begin in range(0, count, block):
+            end = min(begin + block, count)
+            advance(begin, end)
+            if end < count:
+                set_levels(sensed[:, end - 1], inputs[:, end - 1], inputs[:, min(end + block, count) - 1])
+        roll.close()
+        return states, sensed
 
     def _cut(self, n: int) -> Windows:
         episode, start = [], []

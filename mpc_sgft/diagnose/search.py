@@ -15,6 +15,7 @@ from mpc_sgft.diagnose.record import Array, Index
 from mpc_sgft.diagnose.table import INCLUDES
 
 INVISIBLE = 1e-4  # times the noise: an effect of typical size that changes less is no candidate
+FIRST, NEXT = (1.0, 0.1), (0.3,)  # how far from no effect the fits of a first effect start, and of further ones
 SEEN = 1e-3  # a parameter whose derivative is smaller than this share of the largest changes nothing
 
 
@@ -22,7 +23,7 @@ class Effort(NamedTuple):
     """How widely to search.
 
     Attributes:
-        beam: Sets that are extended.
+        beam: Sets that are extended, to two effects, to three.
         full: Candidates that get a full fit: alone, as a second effect, as a third; twice as many get a quick one.
         screen, sharpen: Windows for one step of each, and for quick fits.
         quick, last: Iterations of a quick fit, and of the full one that goes on from it.
@@ -30,14 +31,14 @@ class Effort(NamedTuple):
         pairs: Of those that the screened effects make, how many get a quick fit.
     """
 
-    beam: int = 2
-    full: tuple[int, ...] = (6, 3, 3)
+    beam: tuple[int, ...] = (2, 1)
+    full: tuple[int, ...] = (5, 2, 2)
     screen: int = 6
     sharpen: int = 10
     quick: int = 3
     last: int = 8
     enough: float = NOISE + ABOVE_NOISE
-    pairs: int = 8
+    pairs: int = 6
 
 
 class Entry(NamedTuple):
@@ -135,7 +136,8 @@ def search(
         for b, parent in enumerate(beam):
             report(f"{' + '.join(parent.names) or 'nominal'}", (level + b / len(beam)) / (max_effects + 1))
             full = effort.full[min(level, len(effort.full) - 1)]
-            ranked, samples = screen(setup, parent, proposals(parent, terms, max_effects), effort.screen)
+            options = proposals(parent, terms, max_effects, FIRST if not level else NEXT)
+            ranked, samples = screen(setup, parent, options, effort.screen)
             if not level:
                 pairs = couple(parent, samples, setup, effort) if max_effects > 1 and effort.pairs else []
             for proposal in sharpen(setup, ranked[: 2 * full], effort)[:full]:
@@ -151,7 +153,7 @@ def search(
         found |= new
         if not new:
             break
-        beam = sorted(new.values(), key=lambda e: e.error)[: effort.beam]
+        beam = sorted(new.values(), key=lambda e: e.error)[: effort.beam[min(level, len(effort.beam) - 1)]]
         if judge.credible(best.errors, beam[0].errors, rng, setup.parts):
             best = beam[0]
         elif level or best.error <= effort.enough:
@@ -162,7 +164,7 @@ def search(
 
 
 def proposals(
-    parent: Entry, terms: Sequence[Term], max_effects: int
+    parent: Entry, terms: Sequence[Term], max_effects: int, shares: tuple[float, ...]
 ) -> list[tuple[tuple[Term, ...], list[Array], int]]:
     """Sets one step larger: (terms, start, index of the term that is new), one for each start of the new term."""
     out = []
@@ -178,14 +180,14 @@ def proposals(
             swapped[i] = enrich(term, base[i], values[i])
             out.append(((*base[:i], term, *base[i + 1 :]), swapped, i))
         elif parent.effects < max_effects:
-            out += [((*base, term), [*values, start], len(base)) for start in spread_starts(term)]
+            out += [((*base, term), [*values, start], len(base)) for start in spread_starts(term, shares)]
     return out
 
 
-def spread_starts(term: Term) -> list[Array]:
-    """The starts of a term, and the same a tenth as far from no effect, from where small effects are found."""
+def spread_starts(term: Term, shares: tuple[float, ...]) -> list[Array]:
+    """The starts of a term, at these shares of their distance from no effect."""
     some = [n not in HIDDEN for n in term.names]
-    return [np.where(some, term.neutral + share * (s - term.neutral), s) for share in (1.0, 0.1) for s in term.starts]
+    return [np.where(some, term.neutral + share * (s - term.neutral), s) for share in shares for s in term.starts]
 
 
 def key_of(setup: Setup[Any], terms: Sequence[Term]) -> frozenset[str]:

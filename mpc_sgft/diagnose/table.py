@@ -61,7 +61,7 @@ TABLE: dict[str, Row] = {
         }
     ),
     "armature": Row({"inertia": Par(0.0, lambda s: s.inertia)}),
-    "backlash": Row({"gap": Par(0.0, lambda s: 0.1 * s.travel, (0.03, 0.3), 0.0, 10.0)}, driven=True),
+    "backlash": Row({"gap": Par(0.0, lambda s: 0.1 * s.travel, (0.003, 0.03, 0.3), 0.0, 10.0)}, driven=True),
     "gravity_tilt": Row({"angle": _tilt, "roll": _tilt}, variants=({"roll": 0.0}, {"angle": 0.0}, {})),
     "payload": Row({"mass": Par(0.0, lambda s: s.mass, (0.2,))}),
     "actuator_gain": Row({"gain": Par(1.0, lambda s: 1.0, (-0.1, 0.1), -0.95, 2.0)}),

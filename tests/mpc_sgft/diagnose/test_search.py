@@ -49,7 +49,7 @@ def found(pairs: int) -> list[set[str]]:
     none = np.zeros(1)
     setup = Setup(problem, fitted, np.arange(18, 24), fitted // 3, base, none, none, np.log1p, NOISE)
     terms = [term(name) for name in "abcdefghxy"]
-    entries = search(setup, terms, 2, np.random.default_rng(0), effort=Effort(beam=1, full=(1, 1, 1), pairs=pairs))
+    entries = search(setup, terms, 2, np.random.default_rng(0), effort=Effort(beam=(1,), full=(1, 1, 1), pairs=pairs))
     return [set(e.names) for e in entries if e.error < NOISE + 0.1]
 
 
