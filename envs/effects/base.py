@@ -112,28 +112,35 @@ def available() -> list[str]:
     return sorted(m.name for m in pkgutil.iter_modules(package.__path__) if m.name not in ("base", "passive"))
 
 
-def load(effects: Mapping[str, Mapping[str, Any] | None]) -> list[Effect]:
-    """Build effects from {name: {parameter: value}}.
+Parameters = Mapping[str, Any] | None
+
+
+def load(effects: Mapping[str, Parameters | list[Parameters]]) -> list[Effect]:
+    """Build effects from {name: {parameter: value}}, or {name: [{…}, {…}]} where one acts at several places.
 
     Raises:
         ValueError: For an unknown effect or parameter, or a value out of bounds; the message lists what is allowed.
     """
     built = []
-    for name, parameters in effects.items():
+    for name, given in effects.items():
         if name not in available():
             near = get_close_matches(name, available(), 1)
             hint = f" Did you mean {near[0]}?" if near else ""
             raise ValueError(f"No effect {name!r} in envs/effects/. Available: {', '.join(available())}.{hint}")
-        kind = importlib.import_module(f"envs.effects.{name}").EFFECT
-        allowed = [f.name for f in fields(kind)]
-        unknown = sorted(set(parameters or {}) - set(allowed))
-        if unknown:
-            raise ValueError(f"Effect {name} has no parameter {unknown[0]!r}. It has: {', '.join(allowed)}.")
-        try:
-            built.append(kind(**{k: _as_field(kind, k, v) for k, v in (parameters or {}).items()}))
-        except TypeError as error:
-            raise ValueError(f"Effect {name}: {error}. Its parameters: {', '.join(allowed)}.") from error
+        built += [_one(name, parameters or {}) for parameters in (given if isinstance(given, list) else [given])]
     return built
+
+
+def _one(name: str, parameters: Mapping[str, Any]) -> Effect:
+    kind = importlib.import_module(f"envs.effects.{name}").EFFECT
+    allowed = [f.name for f in fields(kind)]
+    unknown = sorted(set(parameters) - set(allowed))
+    if unknown:
+        raise ValueError(f"Effect {name} has no parameter {unknown[0]!r}. It has: {', '.join(allowed)}.")
+    try:
+        return kind(**{k: _as_field(kind, k, v) for k, v in parameters.items()})
+    except TypeError as error:
+        raise ValueError(f"Effect {name}: {error}. Its parameters: {', '.join(allowed)}.") from error
 
 
 def _as_field(kind: type[Effect], name: str, value: Any) -> Any:

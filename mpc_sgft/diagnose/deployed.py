@@ -185,7 +185,7 @@ def held_out_row(chain: Chain, both: Prediction, setup: Setup[Chain], rng: np.ra
 
 def write(deployment: Deployment, best: Entry, out: Path) -> list[str]:
     """Write effects.yaml and repaired.xml, the task's scene with the effects that MJCF carries; returns notes."""
-    mapping, notes = gap_of(deployment.task, best.terms, best.values)
+    mapping, notes = gap_of(deployment.task, best.terms, best.values), []
     text = yaml.safe_dump({"effects": mapping}, sort_keys=False)
     (out / "effects.yaml").write_text("# Written by mpc_sgft.diagnose.\n" + text)
     spec = deployment.task.spec()

@@ -6,7 +6,7 @@ are cut, so that delays and lags reach back before a window's start.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from functools import partial
 from importlib import import_module
@@ -143,6 +143,18 @@ def make_term(plant: Plant, name: str, place: str, scales: Scales, fixed: Mappin
 def settings(term: Term, value: Array) -> dict[str, Any]:
     """What effects.yaml says of one effect."""
     return {**numbers(term.effect, term.names, value), **term.fixed, **({"at": list(term.at)} if term.at else {})}
+
+
+def as_gap(found: Iterable[tuple[str, dict[str, Any]]]) -> dict[str, Any]:
+    """{effect: parameters} as in configs/gap/*.yaml; a list of parameters where an effect acts at several places.
+
+    Args:
+        found: Name and parameters of each effect.
+    """
+    every: dict[str, list[dict[str, Any]]] = {}
+    for name, parameters in found:
+        every.setdefault(name, []).append(parameters)
+    return {name: places[0] if len(places) == 1 else places for name, places in every.items()}
 
 
 def numbers(effect: str, names: Sequence[str], x: Array) -> dict[str, float]:

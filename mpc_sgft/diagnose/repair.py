@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import mujoco
 
 from envs.effects.base import Effect, load
-from mpc_sgft.diagnose.library import settings
+from mpc_sgft.diagnose.library import as_gap, settings
 from mpc_sgft.diagnose.nominal import scale
 from mpc_sgft.diagnose.plant import FORCE, Plant
 from mpc_sgft.diagnose.search import Entry
@@ -32,18 +31,6 @@ def repaired_spec(plant: Plant, best: Entry) -> tuple[mujoco.MjSpec, list[str]]:
     return spec, notes
 
 
-def effects_mapping(best: Entry) -> tuple[dict[str, dict[str, Any]], list[str]]:
-    """{effect: parameters} as in configs/gap/*.yaml, and what it cannot say."""
-    mapping: dict[str, dict[str, Any]] = {}
-    notes = []
-    for term, value in zip(best.terms, best.values, strict=True):
-        if term.effect in mapping:
-            notes.append(f"effects.yaml holds each effect once: {term.label} is in repaired.xml only")
-        else:
-            mapping[term.effect] = settings(term, value)
-    return mapping, notes
-
-
 def write(plant: Plant, best: Entry, out: Path) -> list[str]:
     """Write repaired.xml and effects.yaml; returns notes.
 
@@ -57,7 +44,7 @@ def write(plant: Plant, best: Entry, out: Path) -> list[str]:
     path = out / "repaired.xml"
     path.write_text(spec.to_xml())
     mujoco.MjModel.from_xml_path(str(path))
-    mapping, more = effects_mapping(best)
+    mapping = as_gap((t.effect, settings(t, v)) for t, v in zip(best.terms, best.values, strict=True))
     refit = {
         f"{t.names[0]} {t.at[0]}": round(float(v[0]), 6)
         for t, v in zip(best.fit.terms, best.fit.values, strict=True)
@@ -67,4 +54,4 @@ def write(plant: Plant, best: Entry, out: Path) -> list[str]:
     if refit:
         head += f"# Refitted nominal quantities (factors, in repaired.xml only): {refit}\n"
     (out / "effects.yaml").write_text(head + yaml.safe_dump({"effects": mapping}, sort_keys=False))
-    return notes + more
+    return notes

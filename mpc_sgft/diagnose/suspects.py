@@ -15,7 +15,7 @@ import numpy as np
 
 from envs.effects.base import Effect, load
 from envs.task import AbstractTask
-from mpc_sgft.diagnose.library import Term, kind_of
+from mpc_sgft.diagnose.library import Term, as_gap, kind_of
 from mpc_sgft.diagnose.record import Array
 from mpc_sgft.errors import unknown
 
@@ -82,18 +82,10 @@ def suspects(task: AbstractTask, effects: Sequence[str] | None = None) -> list[S
     return [s for s in found if effects is None or s.effect in effects]
 
 
-def gap_of(
-    task: AbstractTask, terms: Sequence[Term], values: Sequence[Array]
-) -> tuple[dict[str, dict[str, Any]], list[str]]:
-    """{effect: parameters} as in configs/gap/*.yaml, and what it cannot say."""
-    mapping: dict[str, dict[str, Any]] = {}
-    known, notes = {s.term().label: s for s in suspects(task)}, []
-    for term, value in zip(terms, values, strict=True):
-        if term.effect in mapping:
-            notes.append(f"effects.yaml holds each effect once: {term.label} is left out of it")
-        else:
-            mapping[term.effect] = known[term.label].write(value)
-    return mapping, notes
+def gap_of(task: AbstractTask, terms: Sequence[Term], values: Sequence[Array]) -> dict[str, Any]:
+    """{effect: parameters} as in configs/gap/*.yaml."""
+    known = {s.term().label: s for s in suspects(task)}
+    return as_gap((t.effect, known[t.label].write(v)) for t, v in zip(terms, values, strict=True))
 
 
 def _one(

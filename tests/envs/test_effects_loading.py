@@ -50,6 +50,13 @@ def test_an_unknown_effect_names_the_known_and_the_nearest() -> None:
         effects.load({"actuator_gian": {}})
 
 
+def test_an_effect_may_act_at_several_places() -> None:
+    both = effects.load({"viscous_friction": [{"coefficient": 1.0, "at": ["a"]}, {"coefficient": 2.0, "at": ["b"]}]})
+    assert [(e.coefficient, e.at) for e in both] == [(1.0, ("a",)), (2.0, ("b",))]  # pyright: ignore
+    with pytest.raises(ValueError, match="has no parameter 'x'"):
+        effects.load({"viscous_friction": [{"coefficient": 1.0}, {"x": 1.0}]})
+
+
 def test_an_unknown_parameter_names_the_known() -> None:
     with pytest.raises(ValueError, match="actuator_delay has no parameter 'seconds'. It has: delay, at"):
         effects.load({"actuator_delay": {"seconds": 0.1}})

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 
 from mpc_sgft.diagnose.fit import fit
-from mpc_sgft.diagnose.library import Term, candidates, settings
+from mpc_sgft.diagnose.library import Term, as_gap, candidates, settings
 from mpc_sgft.diagnose.plant import Change, Plant
 from mpc_sgft.diagnose.prepare import NOISE, Setup
 from mpc_sgft.diagnose.search import Effort, search
@@ -62,3 +62,8 @@ def test_gravity_may_turn_about_one_axis_or_both() -> None:
     tilts = candidates(plant, {"": Scales()}, ["gravity_tilt"])
     assert [t.names for t in tilts] == [("angle",), ("roll",), ("angle", "roll")]
     assert settings(tilts[0], np.array([0.1])) == {"angle": 0.1, "roll": 0.0}
+
+
+def test_an_effect_at_two_joints_is_a_list_in_effects_yaml() -> None:
+    gap = as_gap([("payload", {"mass": 1.0}), ("armature", {"at": ["a"]}), ("armature", {"at": ["b"]})])
+    assert gap == {"payload": {"mass": 1.0}, "armature": [{"at": ["a"]}, {"at": ["b"]}]}
