@@ -75,22 +75,37 @@ def _drives(actuator: Any, joint: str) -> bool:
     return bool(joint) and actuator.target == joint and actuator.trntype in kinds and has_input
 
 
-def place_rotors(model: mujoco.MjModel, qpos: Array, qvel: Array) -> None:
-    """Put every rotor where its joint is, in the middle of the play, moving with it; in place.
+def place_rotors(model: mujoco.MjModel, qpos: Array, qvel: Array, qacc: Array | None = None) -> None:
+    """Put every rotor where its joint is, moving with it; in place.
 
-    A start that comes from measured joints has to be completed by this: rotors are not measured.
+    A start that comes from measured joints has to be completed by this: rotors are not measured. A rotor leans against
+    the flank through which it gives its joint the acceleration; without one it is in the middle of the play.
 
     Args:
         model: A scene, with or without rotors.
         qpos: [..., nq], with the joints set.
         qvel: [..., nv], with the joints set.
+        qacc: [..., nv], with the joints set.
     """
-    for i in range(model.njnt):
-        name = model.joint(i).name
-        if name.startswith(ROTOR):
-            joint = model.joint(name.removeprefix(ROTOR))
-            qpos[..., model.jnt_qposadr[i]] = qpos[..., joint.qposadr[0]]
-            qvel[..., model.jnt_dofadr[i]] = qvel[..., joint.dofadr[0]]
+    rotors = [i for i in range(model.njnt) if model.joint(i).name.startswith(ROTOR)]
+    joints = [model.joint(model.joint(i).name.removeprefix(ROTOR)) for i in rotors]
+    for i, joint in zip(rotors, joints, strict=True):
+        qpos[..., model.jnt_qposadr[i]] = qpos[..., joint.qposadr[0]]
+        qvel[..., model.jnt_dofadr[i]] = qvel[..., joint.dofadr[0]]
+    if not rotors or qacc is None:
+        return
+    data = mujoco.MjData(model)
+    needed = np.zeros(model.nv)
+    for at in np.ndindex(qpos.shape[:-1]):
+        data.qpos[:], data.qvel[:] = qpos[at], qvel[at]
+        mujoco.mj_fwdPosition(model, data)
+        mujoco.mj_fwdVelocity(model, data)
+        mujoco.mj_mulM(model, data, needed, qacc[at])
+        dry = model.dof_frictionloss * np.sign(qvel[at])
+        force = needed + data.qfrc_bias - data.qfrc_passive + dry
+        for i, joint in zip(rotors, joints, strict=True):
+            play = model.tendon_range[model.tendon(model.joint(i).name).id, 1]
+            qpos[(*at, model.jnt_qposadr[i])] += play * np.sign(force[joint.dofadr[0]])
 
 
 EFFECT = Backlash

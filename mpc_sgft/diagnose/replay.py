@@ -141,7 +141,10 @@ class Replayer:
         if shift is not None:
             q, v = q + shift[:, None, :nj], v + shift[:, None, nj:]
         state[:, :, 1 + qadr], state[:, :, 1 + m.nq + vadr] = q, v
-        place_rotors(m, state[:, :, 1 : 1 + m.nq], state[:, :, 1 + m.nq : 1 + m.nq + m.nv])
+        qacc = np.zeros((count, m.nv))
+        qacc[:, vadr] = w.a0[pick]
+        for model, rows in zip(models, state, strict=True):
+            place_rotors(model, rows[:, 1 : 1 + m.nq], rows[:, 1 + m.nq : 1 + m.nq + m.nv], qacc)
         nu, extra = len(self.plant.actuators), m.nu - len(self.plant.actuators)
         inputs = np.zeros((len(models), count, self.steps, m.nu + (m.nv if force is not None else 0)))
         order = [m.actuator(a).id for a in self.plant.actuators] if extra else list(range(nu))

@@ -163,6 +163,22 @@ def test_rotors_start_where_their_joints_are(make_task) -> None:
     assert qpos.tolist() == [[0.3, -0.4, 0.3, -0.4]] and qvel.tolist() == [[1.0, 2.0, 1.0, 2.0]]
 
 
+def test_rotors_lean_where_they_push() -> None:
+    """Along a motion with play they are found at the flank where the simulation has them."""
+    spec = mujoco.MjSpec.from_string(PLANTS["two-link arm"])
+    model = _edited(spec, "backlash", {"gap": 0.02}).compile()
+    data, apart = mujoco.MjData(model), []
+    for k in range(3000):
+        data.ctrl[:] = 0.5 * np.sin(0.006 * k + np.arange(2))
+        mujoco.mj_step(model, data)
+        if k > 500 and not k % 10:
+            mujoco.mj_forward(model, data)
+            qpos, qvel = data.qpos.copy()[None], data.qvel.copy()[None]
+            effects.place_rotors(model, qpos, qvel, data.qacc[None])
+            apart += list(np.abs(qpos[0, 2:] - data.qpos[2:]))
+    assert np.mean(np.array(apart) < 0.002) > 0.8  # the rest is on its way from flank to flank
+
+
 @pytest.mark.parametrize("name", sorted(set(SIZES) | {"deadband", "load_dependent_friction"}))
 def test_a_gap_adds_nothing_to_what_a_task_records(make_backend, name) -> None:
     """Hidden joints and actuators must not give the gap away, nor shift what is recorded."""
