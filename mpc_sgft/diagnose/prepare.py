@@ -169,7 +169,8 @@ def simulator_floor(
 
 def _problem(replayer: Replayer, noise: Array, floor: Array, terms: Sequence[Term], values: Sequence[Array]) -> Problem:
     w = replayer.windows
-    sd = np.array([np.concatenate([replayer.smooth[i].q_sd, replayer.smooth[i].v_sd]) for i in w.episode])
+    starts = [(replayer.smooth[i], k) for i, k in zip(w.episode, w.start, strict=True)]
+    sd = np.array([np.concatenate([s.q_sd, s.v_sd[k]]) for s, k in starts])
     speed = np.sqrt(np.mean(w.v0**2, 0)) + 1e-6
     travel = np.ptp(w.q0, axis=0) + 1e-6
     kick = KICK * np.concatenate([travel, speed])

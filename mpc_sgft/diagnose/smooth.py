@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from scipy.ndimage import uniform_filter1d
 from scipy.signal import savgol_coeffs, savgol_filter
 
 from mpc_sgft.diagnose.record import Array, Episode
@@ -19,7 +20,7 @@ class Smooth(NamedTuple):
     Attributes:
         q, v, a: Position, velocity and acceleration at the samples.
         noise: Standard deviation of the position noise.
-        q_sd, v_sd: How uncertain q and v are, but for the ends.
+        q_sd, v_sd: How uncertain q [nj] and v [T, nj] are, but for the ends; more where the velocity has corners.
         half: Samples at either end of the episode where they are more uncertain, a number.
     """
 
@@ -62,13 +63,13 @@ def _one(q: Array, measured_v: Array | None, dt: float) -> tuple[Array, ...]:
         width = 2 * half + 1
         v = np.asarray(savgol_filter(q, width, 3, deriv=1, delta=dt), float)
         spread = noise * float(np.linalg.norm(savgol_coeffs(width, 3, deriv=1, delta=dt)))
-        bias = 0.0 if previous is None else float(np.sqrt(np.mean((v - previous) ** 2)))
-        error = np.hypot(spread, bias)
+        bias = np.zeros(len(q)) if previous is None else v - previous
+        error = np.hypot(spread, float(np.sqrt(np.mean(bias**2))))
         if best is None or error < best[0]:
-            best = (error, width, v)
+            best = (error, width, v, np.maximum(error, np.hypot(spread, _nearby(bias, width))))
         previous = v
     assert best is not None, ("too few samples to smooth", len(q))
-    error, width, v = best
+    error, width, v, v_sd = best
     wide = min(2 * width + 1, (len(q) // 2) * 2 - 1)
     a = np.asarray(savgol_filter(q, max(wide, 5), 3, deriv=2, delta=dt), float)
     level = np.asarray(savgol_filter(q, width, 3), float)
@@ -77,5 +78,10 @@ def _one(q: Array, measured_v: Array | None, dt: float) -> tuple[Array, ...]:
         own = noise_of(measured_v)
         lag = float(np.clip(np.sum((v - measured_v) * a) / max(np.sum(a * a), 1e-30), -dt, dt))
         if own < error:
-            v, error = measured_v + lag * a, own
-    return level, v, a, np.array(noise), np.array(q_sd), np.array(error), np.array(width // 2)
+            v, v_sd = measured_v + lag * a, np.full(len(q), own)
+    return level, v, a, np.array(noise), np.array(q_sd), v_sd, np.array(width // 2)
+
+
+def _nearby(x: Array, width: int) -> Array:
+    """Root mean square of [T] within a width of each sample."""
+    return np.sqrt(np.maximum(uniform_filter1d(x**2, width, mode="nearest"), 0.0))

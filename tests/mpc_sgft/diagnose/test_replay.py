@@ -10,6 +10,7 @@ from mpc_sgft.diagnose.library import candidates, enrich, make_term
 from mpc_sgft.diagnose.plant import Change, Plant
 from mpc_sgft.diagnose.record import Episode
 from mpc_sgft.diagnose.replay import Replayer, _held_mean
+from mpc_sgft.diagnose.smooth import smooth
 from mpc_sgft.diagnose.table import TABLE, Scales
 
 SLIDE = """<mujoco><option timestep="0.002"/><worldbody><body name="cart"><joint name="x" type="slide" axis="1 0 0"/>
@@ -157,5 +158,15 @@ def test_no_window_starts_where_smoothing_knows_one_side_only(plant) -> None:
         q = 0.1 * np.sin(15 * t + k) + 1e-3 * rng.standard_normal(len(t))
         replayer = Replayer(plant, [Episode(f"{k}", 0.002, np.zeros((1000, 1)), {"qpos/x": q})], 0.45, ["qpos/x"])
         true = 1.5 * np.cos(15 * t[replayer.windows.start] + k)
-        apart += list((replayer.windows.v0[:, 0] - true) / replayer.smooth[0].v_sd[0])
+        apart += list((replayer.windows.v0[:, 0] - true) / replayer.smooth[0].v_sd[replayer.windows.start, 0])
     assert np.abs(apart).max() < 4  # at the very end it is up to 13
+
+
+def test_a_start_at_a_corner_of_the_velocity_is_more_uncertain_than_elsewhere() -> None:
+    t = np.arange(2000) * 0.002
+    true = np.where(t % 1.0 < 0.5, 0.4, -0.4)
+    q = np.cumsum(true) * 0.002 + 1e-4 * np.random.default_rng(0).standard_normal(len(t))
+    s = smooth(Episode("a", 0.002, np.zeros((2000, 1)), {"qpos/x": q}), ["x"])
+    off = (np.abs(s.v - true[:, None]) / s.v_sd)[s.half : -s.half]
+    assert (off < 3).mean() > 0.97 and off.max() < 10  # at the corner, where the velocity jumps, it was up to 23
+    assert s.v_sd[240:260].min() > 1.5 * s.v_sd[110:140].max()
