@@ -12,6 +12,8 @@ from mpc_sgft.diagnose.record import Array
 RESAMPLES = 1000
 GAIN_LEVEL = 0.98  # a larger structure must be better with this confidence ...
 TIE_LEVEL = 0.90  # ... while a rival of the same size must be worse with this one, or it ties
+TIE_GAIN = 0.01  # … by more than this in log(1 + e)
+TIE_ODDS = 20.0  # ... or be so much less likely, where what is left is noise
 FEW = 12  # windows
 MIN_GAIN = 0.05  # in log(1 + e): a gain below is not worth a name ...
 MIN_SHARE = 0.05  # ... nor one below this share of the error
@@ -60,9 +62,18 @@ def credible(worse: Array, better: Array, rng: np.random.Generator, parts: int =
     return g.low > 0 and g.mean > max(least, MIN_SHARE * float(worse.mean())) and bool(elsewhere > ELSEWHERE)
 
 
-def worse(rival: Array, best: Array, rng: np.random.Generator) -> bool:
-    """Whether a rival of the same size can be ruled out."""
-    return gain(rival, best, 2 * TIE_LEVEL - 1, rng).low > 0
+def worse(rival: Array, best: Array, rng: np.random.Generator, points: float = 0.0) -> bool:
+    """Whether a rival of the same size can be ruled out.
+
+    Args:
+        rival, best: Errors of the same parts of windows, [W].
+        rng: For the bootstrap.
+        points: Independent residuals of each part if the best leaves noise alone, so that their squares are
+            likelihoods; 0 if it does not.
+    """
+    g = gain(rival, best, 2 * TIE_LEVEL - 1, rng)
+    odds = points * (np.expm1(rival) - np.expm1(best)).sum() / 2
+    return g.mean > TIE_GAIN and bool(g.low > 0 or odds > np.log(TIE_ODDS))
 
 
 def win_shares(errors: Array, complexity: Array, rng: np.random.Generator, points: int) -> Array:

@@ -94,7 +94,7 @@ def judge_entries(
         np.array([e.errors for e in rivals]), np.array([e.complexity for e in rivals]), rng, setup.problem.blocks
     )
     probability |= {e.key: float(s) for e, s in zip(rivals, shares, strict=True)}
-    declared = [(e, equivalence(best, e)) for e in find_ties(best, entries, rng)]
+    declared = [(e, equivalence(best, e)) for e in find_ties(setup, best, entries, rng)]
     base = entries[0]
     if flexible is not None and beats(flexible, best, base, setup.parts, rng):
         missed = (best.error - flexible.error) / max(base.error - flexible.error, 1e-12)
@@ -118,10 +118,11 @@ def judge_entries(
     return Verdict("effect", best, named, probability, f"no larger set is credibly better than {_list(best)}")
 
 
-def find_ties(best: Entry, entries: list[Entry], rng: np.random.Generator) -> list[Entry]:
+def find_ties(setup: Setup[Any], best: Entry, entries: list[Entry], rng: np.random.Generator) -> list[Entry]:
     """Sets no larger than the best that are not credibly worse, best first."""
     rivals = [e for e in entries if e is not best and 0 < e.complexity <= best.complexity and e.effects]
-    return sorted((e for e in rivals if not judge.worse(e.errors, best.errors, rng)), key=lambda e: e.error)
+    points = setup.problem.blocks / setup.parts if settled(best) else 0.0  # of one signal: noise is not quite white
+    return sorted((e for e in rivals if not judge.worse(e.errors, best.errors, rng, points)), key=lambda e: e.error)
 
 
 def equivalence(a: Entry, b: Entry) -> Equivalence | None:

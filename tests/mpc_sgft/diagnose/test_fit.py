@@ -68,3 +68,19 @@ def test_parts_by_hand() -> None:
     squares = np.array([[1.0, 3.0, 5.0, 7.0, 9.0], [0.0, 0.0, 1.0, 1.0, 1.0]])
     np.testing.assert_allclose(by_parts(squares, 2), [2.0, 7.0, 0.0, 1.0])
     np.testing.assert_allclose(by_parts(squares, 1), squares.mean(1))
+
+
+def test_a_rival_that_is_worse_by_next_to_nothing_ties_however_surely_it_is_worse() -> None:
+    rng, best = np.random.default_rng(0), np.linspace(0.5, 0.9, 40)
+    assert not judge.worse(best + 0.005, best, rng)
+    assert judge.worse(best + 0.02, best, rng)
+
+
+def test_where_noise_alone_is_left_a_rival_is_ruled_out_by_its_odds() -> None:
+    rng = np.random.default_rng(0)
+    best = np.log1p(rng.chisquare(10, 24) / 10)
+    rival = best + np.where(np.arange(24) == 0, 0.6, 0.0) + 0.05 * rng.normal(size=24)  # one part shows it
+    apart = 10 * (np.expm1(rival) - np.expm1(best)).sum()
+    assert not judge.worse(rival, best, rng) and apart > 2 * np.log(20)
+    assert judge.worse(rival, best, rng, points=10)
+    assert not judge.worse(rival, best, rng, points=10 * np.log(20) / apart)
