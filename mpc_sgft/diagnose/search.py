@@ -12,10 +12,11 @@ from mpc_sgft.diagnose.fit import STEP, Fit, fit, left_out_errors, robust, typic
 from mpc_sgft.diagnose.library import HIDDEN, Term, enrich, includes
 from mpc_sgft.diagnose.prepare import ABOVE_NOISE, NOISE, Setup
 from mpc_sgft.diagnose.record import Array, Index
-from mpc_sgft.diagnose.table import INCLUDES
+from mpc_sgft.diagnose.table import ALIKE, INCLUDES
 
 INVISIBLE = 1e-4  # times the noise: an effect of typical size that changes less is no candidate
-FIRST, NEXT = (1.0, 0.1), (0.3,)  # how far from no effect the fits of a first effect start, and of further ones
+FIRST, NEXT = (1.0, 0.1, 0.01), (0.3,)  # how far from no effect the fits of a first effect start, and of further ones
+SWAPPED = 2  # of the best sets, in which effects are exchanged for those that start well where they end
 SEEN = 1e-3  # a parameter whose derivative is smaller than this share of the largest changes nothing
 
 
@@ -160,7 +161,26 @@ def search(
             break
         if best.error < setup.quiet:
             break
-    return list(found.values())
+    return list((found | swaps(setup, found, terms, effort)).values())
+
+
+def swaps(
+    setup: Setup[Any], found: dict[frozenset[str], Entry], terms: Sequence[Term], effort: Effort
+) -> dict[frozenset[str], Entry]:
+    """The best sets with one effect exchanged for one that does much the same with the same number.
+
+    Rivals this near must not lose because their fit began elsewhere.
+    """
+    out: dict[frozenset[str], Entry] = {}
+    for e in sorted(found.values(), key=lambda e: e.error)[:SWAPPED]:
+        for i, old in enumerate(e.fit.terms):
+            for new in (t for t in terms if t.at == old.at and {t.effect, old.effect} in ALIKE):
+                changed = (*e.fit.terms[:i], new, *e.fit.terms[i + 1 :])
+                other = entry(setup, fit(setup.problem, changed, e.fit.values, setup.fitted, effort.last))
+                before = found.get(other.key)
+                if before is None or other.error < before.error:
+                    out[other.key] = other
+    return out
 
 
 def proposals(

@@ -82,6 +82,10 @@ INCLUDES: dict[str, dict[str, dict[str, str]]] = {
 }
 
 
+# effects that do much the same to a slow motion with the same number
+ALIKE = [{"actuator_delay", "actuator_lag"}]
+
+
 class Equivalence(NamedTuple):
     """Effects that data of this kind cannot separate where `reason` applies.
 
@@ -103,6 +107,11 @@ EQUIVALENT = [
         "a constant force along a slide: an offset of its drive and a tilt of its base are the same term of the "
         "equations; a spirit level, or a second axis, tells them apart",
         "actuator_offset",
+    ),
+    Equivalence(
+        frozenset({"sensor_offset", "gravity_tilt"}),
+        "an encoder's offset at the first hinge of a machine turns all of it against gravity, and so does a tilted "
+        "base; a spirit level tells them apart",
     ),
     Equivalence(
         frozenset({"payload", "armature"}),
