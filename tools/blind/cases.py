@@ -52,7 +52,7 @@ def label(made: Made) -> dict[str, Any]:
     """All that is hidden about a case, and what scores are split by."""
     case = made.case
     plant = fr3.Arm() if case.plant == "fr3" else PLANTS[case.plant]
-    names = tuple(t["name"] for t in made.truth)
+    where = {t["name"]: t["joint"] for t in made.truth}
     effects = [{**t, "at": place(plant, t["name"], t["joint"])} for t in made.truth]
     return {
         "group": case.group,
@@ -66,7 +66,7 @@ def label(made: Made) -> dict[str, Any]:
         "force_channel": case.force_channel,
         "wrong_nominal": case.wrong,
         "effects": effects,
-        "equivalents": equivalents(case.plant, names, case.force_channel),
+        "equivalents": equivalents(case.plant, where, case.force_channel),
     }
 
 

@@ -240,12 +240,13 @@ SITES["fr3"] |= {"payload": (6,), "armature": _EVERY, "joint_stiffness": _EVERY}
 OUTSIDE_SITES["fr3"] = {name: _EVERY for name in ("cogging", "position_dependent_friction")}
 
 
-def equivalents(plant: str, effects: tuple[str, ...], force_measured: bool) -> list[list[str]]:
-    """Other sets of names whose data are exactly the same, by the equations of motion.
+def equivalents(plant: str, effects: Mapping[str, int], force_measured: bool) -> list[list[str]]:
+    """Other sets of names whose data are exactly the same, by the equations of motion; of effects at joints.
 
     On one joint without gravity a tilt and an offset of the command are the same constant force, and a payload is an
     armature. With one actuator a delay of the command is a delay of everything that is measured. The measured force of
-    the drive tells apart what the command does from what comes after. On the cart an armature is a heavier cart.
+    the drive tells apart what the command does from what comes after. On the cart an armature is a heavier cart. An
+    encoder's offset at the arm's shoulder turns the whole arm, and so does a tilt.
     On the FR3, whose weight is compensated, an encoder that reads too much, or by a factor, shows what a servo does
     whose command is shifted or scaled, but for what a milliradian changes of the arm's inertia.
     """
@@ -253,6 +254,10 @@ def equivalents(plant: str, effects: tuple[str, ...], force_measured: bool) -> l
     if plant == "fr3":
         swaps = {"actuator_offset": ["sensor_offset"], "sensor_offset": ["actuator_offset"]}
         swaps |= {"actuator_gain": ["sensor_gain"]}
+    if plant == "arm":
+        swaps = {"gravity_tilt": ["sensor_offset"]}
+        if effects.get("sensor_offset") == 0:
+            swaps["sensor_offset"] = ["gravity_tilt"]
     if plant == "slide":
         swaps = {"payload": ["armature"], "armature": ["payload"]}
         if not force_measured:

@@ -14,7 +14,7 @@ from tools.blind.loop import JITTER_STEPS, H, Record, Sensor, Tracking, simulate
 from tools.blind.plants import PLANTS, Array, Plant
 from tools.blind.truths import join, rows, take
 
-ATTEMPTS = 2
+ATTEMPTS = 6  # to draw a case whose effects can be made large enough
 TIMESTAMP_SD = 5e-6  # [s] of the clock, where there is jitter
 BODY_MASSES = ("m", "m1", "m2", "i", "i1", "i2")
 WILD = {"slide": 1.5, "hinge": 6.0}  # [m or rad] a run that goes further is made again with smaller effects

@@ -35,12 +35,14 @@ def test_every_effect_and_everything_outside_occurs() -> None:
 
 
 def test_equivalents_follow_the_equations_of_motion() -> None:
-    assert equivalents("slide", ("payload",), False) == [["armature"]]
-    assert equivalents("slide", ("actuator_offset",), True) == []
-    assert equivalents("pendulum", ("actuator_delay", "viscous_friction"), False) == [
+    assert equivalents("slide", {"payload": 0}, False) == [["armature"]]
+    assert equivalents("slide", {"actuator_offset": 0}, True) == []
+    assert equivalents("pendulum", {"actuator_delay": 0, "viscous_friction": 0}, False) == [
         ["sensor_delay", "viscous_friction"]
     ]
-    assert equivalents("arm", ("armature",), False) == []
+    assert equivalents("arm", {"armature": 0}, False) == []
+    assert equivalents("arm", {"sensor_offset": 0}, False) == [["gravity_tilt"]]
+    assert equivalents("arm", {"sensor_offset": 1}, False) == []
 
 
 def test_the_search_finds_where_the_change_equals_the_noise() -> None:

@@ -7,7 +7,7 @@ import pytest
 from tools.blind.integrate import Integrator, start
 from tools.blind.loop import H
 from tools.blind.mjcf import build, draw_nominal
-from tools.blind.plants import PLANTS, Plant
+from tools.blind.plants import PLANTS, Plant, prepare
 from tools.blind.truths import rows
 
 Q, V = np.array([[0.3, 0.8]]), np.array([[0.4, -1.5]])
@@ -83,3 +83,11 @@ def test_payload_and_tilt_mean_what_mujoco_means(name: str) -> None:
     first = start(Q[:, : plant.n], V[:, : plant.n])
     slope = integrator._slope(integrator.forces, first.y, first.s, off, 0.0)
     assert np.allclose(slope[1, 0], data.qacc, rtol=1e-7)
+
+
+def test_an_arm_with_a_shifted_shoulder_encoder_moves_like_a_tilted_one() -> None:
+    q, v = np.array([[0.4, -0.7]]), np.array([[1.0, -2.0]])
+    nominal = rows(PLANTS["arm"], draw_nominal(PLANTS["arm"], np.random.default_rng(0)), 1)
+    tilted = nominal | {"tilt": nominal["tilt"] + 0.03}
+    shifted = PLANTS["arm"].bias(q - [0.03, 0.0], v, prepare(PLANTS["arm"], nominal))
+    assert np.allclose(shifted, PLANTS["arm"].bias(q, v, prepare(PLANTS["arm"], tilted)))

@@ -61,6 +61,8 @@ def test_f1_of_a_pair() -> None:
     assert score.f1(report("effect", "a"), truth) == pytest.approx(2 / 3)
     assert score.f1(report("effect", "a", "c"), truth) == pytest.approx(1 / 2)
     assert score.f1(report("none"), truth) == 0.0
+    assert score.f1(report("not_identifiable", "a", "b", ties=[["a", "c"]]), truth) == pytest.approx(2 / 3)
+    assert score.f1(report("not_identifiable", "a", ties=[["c"]]), truth) == 0.0
 
 
 def test_coverage_and_oracle() -> None:
