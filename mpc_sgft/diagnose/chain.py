@@ -51,6 +51,8 @@ class Chain:
         most: Windows at most; those in which objects move come first, and no more of the others than of these.
     """
 
+    step, pattern = 0.1, (1.0, 0.3, 0.1, 0.03)
+
     def __init__(self, deployment: Deployment, length: int, most: int):
         task, self.episodes = deployment.task, deployment.episodes
         self.task = task

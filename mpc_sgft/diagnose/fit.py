@@ -21,6 +21,7 @@ MAX_POINTS = 40  # residuals per window and signal; more samples are averaged
 STEP = 1e-2  # finite differences, in typical sizes of a parameter
 TOLERANCE = 1e-3  # relative gain of an iteration that is too small to go on
 ITERATIONS = 12
+MOST_STEPS = 8  # of a pattern search, of one size
 OUTLYING = 4.0  # times the median error, or noise
 MOST_FLOOR = 10.0  # times the noise: the simulator's own error weighs a point down by no more
 
@@ -70,9 +71,17 @@ def change_of(terms: Sequence[Term], values: Sequence[Array]) -> Change:
 
 
 class Residuals(Protocol):
-    """What can be fitted. `blocks` is the number of independent points of a signal in a window."""
+    """What can be fitted.
+
+    Attributes:
+        blocks: Number of independent points of a signal in a window.
+        step: Finite differences, in typical sizes of a parameter.
+        pattern: Steps of a pattern search where derivatives mislead, in typical sizes; none where residuals are smooth.
+    """
 
     blocks: int
+    step: float
+    pattern: tuple[float, ...]
 
     def residuals(self, terms: Sequence[Term], points: Sequence[Sequence[Array]], pick: Index) -> Array:
         """Whitened residuals of one structure at K points on some windows, [K, W, m]."""
@@ -92,6 +101,8 @@ class Problem:
     Attributes:
         floor_share: Of each residual's expected square, how much is the simulator's, 0…1, [W, m].
     """
+
+    step, pattern = STEP, ()
 
     def __init__(self, replayer: Replayer, sigma: Array, floor: Array, start_sd: Array, sensitivity: Array):
         self.replayer, self.sigma = replayer, sigma
@@ -160,14 +171,36 @@ def fit(
         J = None
         if before - costs[best] < TOLERANCE * before:
             break
+    if problem.pattern:
+        x, J = _walk(problem, flat, x, pick), None
     if J is None:
         r, J = _linearise(problem, flat, x, pick)
     assert r is not None
     return Fit(tuple(terms), tuple(flat.unpack(x)), r, J)
 
 
+def _walk(problem: Residuals, flat: _Flat, x: Array, pick: Index) -> Array:
+    """Pattern search (Hooke and Jeeves, 1961): to the best of a step along each parameter, while that is better.
+
+    Where contacts begin and end within a window, residuals are rugged: their derivatives are noise, and Gauss-Newton
+    takes steps that are too short.
+    """
+    scale = typical(problem.residuals(flat.terms, [flat.unpack(x)], pick)[0])
+    lowest = np.inf
+    for size in problem.pattern:
+        around = size * np.concatenate([np.zeros((1, flat.count)), np.eye(flat.count), -np.eye(flat.count)])
+        for _ in range(MOST_STEPS):
+            tries = [flat.clip(x + a) for a in around]
+            costs = robust(problem.residuals(flat.terms, [flat.unpack(t) for t in tries], pick), scale)
+            best = int(np.argmin(costs))
+            if not best or costs[best] >= (1 - TOLERANCE) * min(lowest, float(costs[0])):
+                break
+            x, lowest = tries[best], float(costs[best])
+    return x
+
+
 def _linearise(problem: Residuals, flat: _Flat, x: Array, pick: Index) -> tuple[Array, Array]:
-    steps = flat.steps(x)
+    steps = flat.steps(x, problem.step)
     points = [x, *(x + steps[i] * np.eye(flat.count)[i] for i in range(flat.count))]
     all_r = problem.residuals(flat.terms, [flat.unpack(p) for p in points], pick)
     return all_r[0], np.moveaxis((all_r[1:] - all_r[0]) / steps[:, None, None], 0, -1)
@@ -206,9 +239,9 @@ class _Flat:
     def clip(self, x: Array) -> Array:
         return np.clip(x, self.low, self.high)
 
-    def steps(self, x: Array) -> Array:
+    def steps(self, x: Array, step: float) -> Array:
         """Finite-difference steps that stay inside the bounds."""
-        return np.where(x + STEP > self.high, -STEP, STEP)
+        return np.where(x + step > self.high, -step, step)
 
 
 def by_parts(squares: Array, parts: int) -> Array:

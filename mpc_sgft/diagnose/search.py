@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mpc_sgft.diagnose import judge
-from mpc_sgft.diagnose.fit import STEP, Fit, fit, left_out_errors, robust, typical, weights, window_errors
+from mpc_sgft.diagnose.fit import Fit, fit, left_out_errors, robust, typical, weights, window_errors
 from mpc_sgft.diagnose.library import HIDDEN, Term, enrich, includes
 from mpc_sgft.diagnose.prepare import ABOVE_NOISE, NOISE, Setup
 from mpc_sgft.diagnose.record import Array, Index
@@ -225,7 +225,8 @@ def screen(
     samples: list[Sample] = []
     for terms, start, new in options:
         term = terms[new]
-        steps = [(-STEP if start[new][i] + STEP * s > term.high[i] else STEP) * s for i, s in enumerate(term.size)]
+        d = problem.step
+        steps = [(-d if start[new][i] + d * s > term.high[i] else d) * s for i, s in enumerate(term.size)]
         points = [start]
         for i, step in enumerate(steps):
             moved = list(start)

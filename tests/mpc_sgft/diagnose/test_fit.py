@@ -28,7 +28,7 @@ SLOPE = Term(
 class Line:
     """r = a x - y with y = 2 x and unit noise, 20 windows of 40 points; in the last one y is 50 higher."""
 
-    blocks = 40
+    blocks, step, pattern = 40, 1e-2, ()
 
     def __init__(self) -> None:
         rng = np.random.default_rng(0)
@@ -84,3 +84,21 @@ def test_where_noise_alone_is_left_a_rival_is_ruled_out_by_its_odds() -> None:
     assert not judge.worse(rival, best, rng) and apart > 2 * np.log(20)
     assert judge.worse(rival, best, rng, points=10)
     assert not judge.worse(rival, best, rng, points=10 * np.log(20) / apart)
+
+
+class Rugged(Line):
+    """r = (a - 2) x with a ripple on it, whose derivative is thirty times as large."""
+
+    pattern = (1.0, 0.3, 0.1, 0.03)
+
+    def residuals(self, terms: Sequence[Term], points: Sequence[Sequence[np.ndarray]], pick: np.ndarray) -> np.ndarray:
+        slopes = np.array([p[0][0] for p in points])[:, None, None]
+        return (slopes - 2.0) * self.x[pick] + 0.1 * np.sin(300 * slopes + 10 * self.x[pick])
+
+
+def test_a_pattern_search_goes_on_where_derivatives_mislead() -> None:
+    found = fit(Rugged(), [SLOPE], [np.zeros(1)], np.arange(20))
+    assert abs(found.values[0][0] - 2.0) < 0.05
+    rugged = Rugged()
+    rugged.pattern = ()
+    assert abs(fit(rugged, [SLOPE], [np.zeros(1)], np.arange(20)).values[0][0] - 2.0) > 0.1

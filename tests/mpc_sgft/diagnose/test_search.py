@@ -26,7 +26,7 @@ def term(name: str) -> Term:
 class Lines:
     """r = y - sum of a_i x_i over the effects; y is the difference of two columns that are nearly the same."""
 
-    blocks = 40
+    blocks, step, pattern = 40, 1e-2, ()
 
     def __init__(self) -> None:
         rng = np.random.default_rng(1)
