@@ -51,7 +51,7 @@ class Chain:
         most: Windows at most; those in which objects move come first, and no more of the others than of these.
     """
 
-    step, pattern = 0.1, (1.0, 0.3, 0.1, 0.03)
+    step, pattern = 0.1, (1.0, 0.3, 0.1, 0.03)  # contacts make residuals rugged
 
     def __init__(self, deployment: Deployment, length: int, most: int):
         task, self.episodes = deployment.task, deployment.episodes

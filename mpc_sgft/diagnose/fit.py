@@ -186,16 +186,15 @@ def _walk(problem: Residuals, flat: _Flat, x: Array, pick: Index) -> Array:
     takes steps that are too short.
     """
     scale = typical(problem.residuals(flat.terms, [flat.unpack(x)], pick)[0])
-    lowest = np.inf
     for size in problem.pattern:
         around = size * np.concatenate([np.zeros((1, flat.count)), np.eye(flat.count), -np.eye(flat.count)])
         for _ in range(MOST_STEPS):
             tries = [flat.clip(x + a) for a in around]
             costs = robust(problem.residuals(flat.terms, [flat.unpack(t) for t in tries], pick), scale)
             best = int(np.argmin(costs))
-            if not best or costs[best] >= (1 - TOLERANCE) * min(lowest, float(costs[0])):
+            if costs[best] >= (1 - TOLERANCE) * costs[0]:
                 break
-            x, lowest = tries[best], float(costs[best])
+            x = tries[best]
     return x
 
 

@@ -12,7 +12,7 @@ from mpc_sgft.diagnose.record import Array
 RESAMPLES = 1000
 GAIN_LEVEL = 0.98  # a larger structure must be better with this confidence ...
 TIE_LEVEL = 0.90  # ... while a rival of the same size must be worse with this one, or it ties
-TIE_GAIN = 0.01  # … by more than this in log(1 + e)
+TIE_GAIN = 0.01  # ... by more than this in log(1 + e)
 TIE_ODDS = 20.0  # ... or be so much less likely, where what is left is noise
 FEW = 12  # windows
 MIN_GAIN = 0.05  # in log(1 + e): a gain below is not worth a name ...
