@@ -17,7 +17,7 @@ from mpc_sgft.diagnose.search import Entry, entry
 from mpc_sgft.diagnose.table import EQUIVALENT, Equivalence
 
 UNEXPLAINED = 0.05  # share of what any model can explain that named effects may miss before the answer is "unknown"
-NEXT_GAIN = 0.1  # in log(1 + e), of one more effect where those before leave noise alone
+NEXT_GAIN = 0.1  # in log(1 + e), of one more effect where noise alone is left
 WIDER = 1.3  # of intervals: what windows that begin at each other's ends share; set on development seeds
 EXPLAINED = 0.75  # share of the error above noise that names must explain
 
@@ -53,8 +53,9 @@ def choose(setup: Setup[Any], entries: list[Entry], rng: np.random.Generator) ->
 
 
 def gains(setup: Setup[Any], small: Entry, large: Entry, rng: np.random.Generator) -> bool:
-    """Whether a larger set is credibly better; where effects leave noise alone, one more must gain more."""
-    least = NEXT_GAIN if small.effects and settled(small) else judge.MIN_GAIN
+    """Whether a larger set is credibly better; where noise alone is left, one more effect must gain more."""
+    noise_alone = small.error < setup.quiet or bool(small.effects) and settled(small)
+    least = NEXT_GAIN if noise_alone else judge.MIN_GAIN
     return judge.credible(small.errors, large.errors, rng, setup.parts, least)
 
 

@@ -174,7 +174,9 @@ def swaps(
     out: dict[frozenset[str], Entry] = {}
     for e in sorted(found.values(), key=lambda e: e.error)[:SWAPPED]:
         for i, old in enumerate(e.fit.terms):
-            for new in (t for t in terms if t.at == old.at and {t.effect, old.effect} in ALIKE):
+            there = {t.label for t in e.terms}
+            alike = (t for t in terms if t.at == old.at and {t.effect, old.effect} in ALIKE)
+            for new in (t for t in alike if t.label not in there):
                 changed = (*e.fit.terms[:i], new, *e.fit.terms[i + 1 :])
                 other = entry(setup, fit(setup.problem, changed, e.fit.values, setup.fitted, effort.last))
                 before = found.get(other.key)

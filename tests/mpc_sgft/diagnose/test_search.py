@@ -9,9 +9,10 @@ import numpy as np
 
 from mpc_sgft.diagnose.fit import fit
 from mpc_sgft.diagnose.library import Term, as_gap, candidates, settings
+from mpc_sgft.diagnose.name import gains
 from mpc_sgft.diagnose.plant import Change, Plant
 from mpc_sgft.diagnose.prepare import NOISE, Setup
-from mpc_sgft.diagnose.search import Effort, search
+from mpc_sgft.diagnose.search import Effort, entry, search, swaps
 from mpc_sgft.diagnose.table import Scales
 
 PENDULUM = """<mujoco><worldbody><body><joint name="hinge" axis="0 1 0"/><geom size="0.05" pos="0 0 -0.4" mass="1"/>
@@ -55,6 +56,32 @@ def found(pairs: int) -> list[set[str]]:
 
 def test_two_effects_that_nearly_cancel_are_found_together() -> None:
     assert found(pairs=4) == [{"x", "y"}]
+
+
+def test_a_delay_is_exchanged_for_a_lag_but_not_where_there_is_one() -> None:
+    problem, fitted, none = Lines(), np.arange(18), np.zeros(1)
+    terms = [term("actuator_delay"), term("actuator_lag")]
+    problem.columns |= {"actuator_delay": problem.columns["x"], "actuator_lag": problem.columns["y"]}
+    setup = Setup(problem, fitted, np.arange(18, 24), fitted // 3, fit(problem, [], [], fitted), none, none, np.log1p)
+    alone, both = (entry(setup, fit(problem, t, [none] * len(t), fitted)) for t in (terms[:1], terms))
+    assert [e.names for e in swaps(setup, {alone.key: alone}, terms, Effort()).values()] == [["actuator_lag"]]
+    assert not swaps(setup, {both.key: both}, terms, Effort())
+
+
+def test_where_noise_alone_is_left_an_effect_must_gain_more() -> None:
+    problem, fitted, none = Lines(), np.arange(18), np.zeros(1)
+    setup = Setup(
+        problem, fitted, np.arange(18, 24), fitted // 3, fit(problem, [], [], fitted), none, none, quiet=NOISE + 0.1
+    )
+    base, rng = entry(setup, setup.baseline), np.random.default_rng(0)
+    scatter = np.abs(0.01 * rng.normal(size=24))
+
+    def better(before: float, gain: float) -> bool:
+        small, large = (base._replace(errors=x + scatter) for x in (before, before - gain - scatter))
+        return gains(setup, small, large, rng)
+
+    assert not better(0.65, 0.07) and better(0.65, 0.15)
+    assert better(0.95, 0.07)
 
 
 def test_gravity_may_turn_about_one_axis_or_both() -> None:
