@@ -1,7 +1,9 @@
 """What diagnose found in deployments, one CSV row each effect.
 
-python -m mpc_sgft.diagnose --run runs/push/A                    # writes runs/push/A/diagnosis/
-python -m tools.diagnose_table results/diagnose_run.csv runs/push/A runs/push/B
+    python -m mpc_sgft.diagnose --run runs/push/A                    # writes runs/push/A/diagnosis/
+    python -m tools.diagnose_table results/diagnose_run.csv runs/push/A runs/push/B
+
+Gap, seed and rollouts are those of each run's summary.json.
 """
 
 import argparse
