@@ -82,7 +82,7 @@ class Agent:
         self.log_entropy_coef = torch.tensor(entropy_coef, device=self.device).log().requires_grad_()
         self._averaged = AveragedModel(self.model, multi_avg_fn=get_ema_multi_avg_fn(average_decay))
         self.method: str | None = None  # None while pretraining
-        self.horizon = 0
+        self.horizon = 0  # imagined steps of the policy's objective; 0 in pretraining: it climbs the critics
         self.trainable: tuple[str, ...] = (*PRETRAINED, "normalizer", "target_q")
         self._anchored: list[Tensor] = []
         self._make_optimizers(lr, lr)
@@ -97,6 +97,11 @@ class Agent:
         for optimizer in (self.model_optimizer, self.policy_optimizer):
             for group in optimizer.param_groups:
                 group["lr"] = share * group.setdefault("full_lr", group["lr"])
+
+    def hold_value(self, held: bool) -> None:
+        """Whether encoder and V stay as they are while everything else learns in simulation."""
+        for part in ("encoder", "value_head"):
+            getattr(self.model, part).requires_grad_(not held)
 
     # -- learning in simulation ----------------------------------------------------------------------------------------
 
@@ -143,7 +148,8 @@ class Agent:
         metrics["grad_norm"] = torch.nn.utils.clip_grad_norm_(self._model_parameters, self.grad_clip, foreach=True)
         self.model_optimizer.step()
 
-        metrics |= self._update_policy(zs.detach())
+        imagine = self.method is None and self.horizon > 0
+        metrics |= self._update_policy_imagined(encoded[0]) if imagine else self._update_policy(zs.detach())
         model.update_targets(self.target_rate)
         if self.method is None:
             self._averaged.update_parameters(model)
@@ -158,6 +164,18 @@ class Agent:
         coef = self.log_entropy_coef.detach().exp()
         loss = losses.over_time(losses.policy_loss(q, log_prob, coef, scale), self.rho)
         return self._step_policy(loss, log_prob) | {"entropy_coef": coef, "scale": scale}
+
+    def _update_policy_imagined(self, starts: Tensor) -> dict[str, Tensor]:
+        coef = self.log_entropy_coef.detach().exp()
+        return self._climb(starts, coef) | {"entropy_coef": coef}
+
+    def _climb(self, starts: Tensor, coef: Tensor | float) -> dict[str, Tensor]:
+        """A step of the policy up the SGFT objective of imagined steps from latents [B, D]."""
+        noise = self._noise(self.horizon, len(starts))
+        objective, log_prob = losses.imagined_objective(self.model, starts, noise, self.discount)
+        scale = self.scale.update(objective.detach())
+        metrics = self._step_policy(coef * log_prob.mean() - objective.mean() / scale, log_prob)
+        return metrics | {"objective": objective.mean(), "scale": scale}
 
     def _step_policy(self, loss: Tensor, log_prob: Tensor) -> dict[str, Tensor]:
         check_finite({"policy_loss": loss})
@@ -259,13 +277,7 @@ class Agent:
         metrics["grad_norm"] = torch.nn.utils.clip_grad_norm_(self._model_parameters, self.grad_clip, foreach=True)
         self.model_optimizer.step()
 
-        starts = encoded[0]  # [B, D]
-        noise = self._noise(self.horizon, len(starts))
-        objective, log_prob = losses.imagined_objective(self.model, starts, noise, self.discount)
-        scale = self.scale.update(objective.detach())
-        policy_loss = self.transfer_entropy_coef * log_prob.mean() - objective.mean() / scale
-        metrics |= self._step_policy(policy_loss, log_prob)
-        return _floats(metrics | {"objective": objective.mean(), "scale": scale})
+        return _floats(metrics | self._climb(encoded[0], self.transfer_entropy_coef))
 
     @torch.no_grad()
     def model_error(self, batch: TensorDictBase) -> Tensor:

@@ -28,6 +28,7 @@ def pretrain(cfg: DictConfig) -> int:
     env = build.make_env(cfg, cfg.num_envs, randomised=True)
     judge = build.make_env(cfg, cfg.eval_episodes, randomised=True)
     agent = start_agent(cfg, env)
+    agent.horizon = cfg.imagined_steps
     buffer = instantiate(cfg.train.replay, seed=cfg.seed)
     state = {"round": 0, "updates": 0, "transitions": 0, "episodes": 0, "seconds": 0.0, "streak": 0}
     saved = folder / "checkpoint" / "state.pt"
@@ -64,6 +65,7 @@ def pretrain(cfg: DictConfig) -> int:
         state["episodes"] = int(data["episode"].max()) + 1
         metrics: dict[str, float] = {"train_success": score(data).success}
         agent.scale_learning_rates(0.5 ** (state["transitions"] / cfg.lr_halves_every))
+        agent.hold_value(state["transitions"] <= cfg.hold_value)
         owed = int(state["transitions"] * cfg.updates_per_transition) - state["updates"]
         for _ in range(owed):
             metrics |= agent.update(buffer.sample())

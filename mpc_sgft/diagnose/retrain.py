@@ -17,6 +17,7 @@ from mpc_sgft.diagnose.deployment import run_config
 from mpc_sgft.errors import UserError
 
 TARGET = 0.95  # success that counts as solved
+HELD = 3  # share of retraining, one in so many, that leaves encoder and V alone
 HEAD = "              |  zero-shot |    final | rollouts to 95 %"
 
 
@@ -69,6 +70,7 @@ def pretrain_config(cfg: DictConfig, effects: Mapping[str, Any], folder: Path, t
         made.eval_episodes = made.final_episodes = cfg.eval_episodes
         made.random_transitions = 0  # the policy prior collects from the first round on
         made.lr_halves_every = max(1, transitions // 2)
+        made.imagined_steps, made.hold_value = int(cfg.planner.horizon), transitions // HELD
     OmegaConf.resolve(made)
     return made
 

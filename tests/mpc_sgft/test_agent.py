@@ -279,3 +279,36 @@ def test_a_loss_that_is_not_finite_is_named_and_changes_nothing():
     with pytest.raises(FloatingPointError, match="^reward_loss is not finite"):
         agent.update(make_batch())
     assert changed(before, parts(agent)) == {"normalizer", "reward_head"}  # nan is never equal to itself
+
+
+def test_while_the_value_is_held_encoder_and_value_head_stay_and_all_else_learns():
+    agent = make_agent()
+    agent.hold_value(True)
+    before = copy.deepcopy(agent.model.state_dict())
+    agent.update(make_batch())
+    held = ("encoder.", "value_head.")
+    moved = {name.split(".")[0] for name, x in agent.model.state_dict().items() if not torch.equal(x, before[name])}
+    assert all(torch.equal(x, before[n]) for n, x in agent.model.state_dict().items() if n.startswith(held))
+    assert {"dynamics", "reward_head", "q_ensemble", "policy_head", "decoder"} <= moved
+    agent.hold_value(False)
+    agent.update(make_batch())
+    for part in held:
+        assert any(not torch.equal(x, before[n]) for n, x in agent.model.state_dict().items() if n.startswith(part))
+
+
+@pytest.mark.parametrize("steps", [0, 4])
+def test_with_imagined_steps_the_policy_does_not_climb_the_critics(steps):
+    plain, other = make_agent(), make_agent()
+    for agent in (plain, other):
+        agent.horizon = steps
+    with torch.no_grad():
+        for p in other.model.q_ensemble.parameters():
+            p.normal_()
+    for agent in (plain, other):
+        agent.hold_value(True)  # the critics' gradients reach the dynamics after this update only
+        agent.model_optimizer.step = lambda: None
+        agent.update(make_batch())
+    same = all(
+        torch.equal(a, b) for a, b in zip(*(x.model.policy_head.parameters() for x in (plain, other)), strict=True)
+    )
+    assert same == (steps > 0)

@@ -20,6 +20,7 @@ def test_pretraining_gets_the_found_effects_and_not_the_gap(tmp_path: Path) -> N
     assert made.gap.effects == FOUND and "dev_late" not in str(made)
     assert (made.transitions, made.random_transitions, made.seed) == (5000, 0, 4)
     assert Path(made.checkpoint).name == "push.safetensors" and made.task == run.task
+    assert (made.imagined_steps, made.hold_value) == (run.planner.horizon, 1666)
     assert set(made.randomize.draws) == {"mass", "friction", "gain", "latency"}
 
 
