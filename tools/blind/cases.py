@@ -8,6 +8,7 @@ DIR/reports/<name>/ what the solver wrote
 
 import hashlib
 import json
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -67,7 +68,15 @@ def label(made: Made) -> dict[str, Any]:
         "wrong_nominal": case.wrong,
         "effects": effects,
         "equivalents": equivalents(case.plant, where, case.force_channel),
+        "alike": instead([(t["name"], t["alike"]) for t in made.truth]),
     }
+
+
+def instead(effects: list[tuple[str, list[str]]]) -> list[list[str]]:
+    """Sets of names that these data cannot tell from the hidden set: some replaced by names alike (see alike)."""
+    own = sorted(name for name, _ in effects)
+    sets = {tuple(sorted(names)) for names in product(*([name, *others] for name, others in effects))}
+    return [list(names) for names in sorted(sets) if list(names) != own and len(set(names)) == len(names)]
 
 
 def labels(out: Path) -> dict[str, dict[str, Any]]:

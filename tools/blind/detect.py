@@ -45,10 +45,18 @@ def window_starts(seconds: Array, owner: Array, dt: float) -> tuple[Array, Array
     return np.array(row), np.array(tick)
 
 
-def change(
-    plant: Plant, truth: Rows, nominal: Rows, reference: Record, row: Array, tick: Array, dt: float, floor: Array
+def trace(
+    plant: Plant,
+    truth: Rows,
+    nominal: Rows,
+    reference: Record,
+    row: Array,
+    tick: Array,
+    dt: float,
+    floor: Array,
+    force_floor: Array | None = None,
 ) -> Array:
-    """Root mean square of what the effect changes, in noise floors, [W, n], for W windows.
+    """What the effect changes in what is measured, in noise floors, [W, T, n + a], for W windows.
 
     Args:
         plant: The kind of machine.
@@ -59,6 +67,7 @@ def change(
         tick: Tick at which its lead begins, [W].
         dt: Tick [s].
         floor: Noise floor [m or rad], [W, n].
+        force_floor: Of the measured forces of the drives [N or N m], inf where none is measured, [W, a]; or None.
     """
     lead, total = round(LEAD / dt), round((LEAD + WINDOW) / dt)
     total = min(total, reference.ctrl.shape[1])
@@ -70,7 +79,15 @@ def change(
         begin = start(real.clean[:, lead], real.clean_speed[:, lead])
         model = simulate(plant, nominal, begin, total - lead, per_tick, commands=ctrl[:, lead:])
         apart = (real.clean[:, lead:] - model.clean) / floor[:, None]
-        return np.sqrt(np.mean(apart**2, 1))
+        if force_floor is None:
+            return apart
+        return np.concatenate([apart, (real.force[:, lead:] - model.force) / force_floor[:, None]], 2)
+
+
+def size_of(traces: Array) -> Array:
+    """Root mean square over time, [W, T, n] -> [W, n]."""
+    with np.errstate(all="ignore"):
+        return np.sqrt(np.mean(traces**2, 1))
 
 
 def detectable(

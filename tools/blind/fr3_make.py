@@ -87,6 +87,7 @@ class _Bench:
                     "detectable": unit if np.isfinite(unit) else None,
                     "multiple": size / unit if np.isfinite(unit) else 0.0,
                     "parameters": entry.report(size, given.shape, scale),
+                    "alike": [],
                 }
             )
         if not fits and not last:

@@ -6,8 +6,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tools.blind.detect import LEAD, WINDOW, change, detectable, window_starts
-from tools.blind.draw import COUNT, EPISODE, NOISE, TICK, Case, redraw
+from tools.blind.alike import alike
+from tools.blind.detect import LEAD, WINDOW, detectable, size_of, trace, window_starts
+from tools.blind.draw import COUNT, EPISODE, NOISE, TICK, Case, Given, redraw
 from tools.blind.excite import Reference, plan, reference
 from tools.blind.library import EVERYTHING
 from tools.blind.loop import JITTER_STEPS, H, Record, Sensor, Tracking, simulate, start
@@ -137,9 +138,11 @@ class _Batch:
             if sane.all():
                 break
             sizes = [s if ok else [0.5 * x for x in s] for s, ok in zip(sizes, sane, strict=True)]
-        progress(0.3)
+        progress(0.1)
+        same = self._alike(calm, scales, sizes)
+        progress(0.2)
         return [
-            self._made(i, record, sizes[i], unit[i], scales[i]) if (fits[i] and sane[i]) or last else None
+            self._made(i, record, sizes[i], unit[i], scales[i], same[i]) if (fits[i] and sane[i]) or last else None
             for i in range(len(self.cases))
         ]
 
@@ -248,7 +251,7 @@ class _Batch:
             p = {key: v.copy() for key, v in nominal.items()}
             for (_, given), entry, scale, size, span in zip(hidden, entries, place, sizes, spans, strict=True):
                 entry.apply(p, span, given.joint, float(size), given.shape, scale)
-            moved = change(self.plant, p, nominal, calm, row[mine], tick[mine], self.dt, floor)
+            moved = size_of(trace(self.plant, p, nominal, calm, row[mine], tick[mine], self.dt, floor))
             moved = np.where(np.isfinite(moved), moved, 1e6)
             return np.array([np.sqrt(np.mean(moved[span] ** 2, 0)).max() for span in spans])
 
@@ -262,8 +265,45 @@ class _Batch:
             units[i].append(float(size))
         return units
 
+    def _alike(
+        self, calm: Record, scales: list[list[dict[str, float]]], sizes: list[list[float]]
+    ) -> list[list[list[str]]]:
+        """Names that these data cannot tell from each effect of each case (see alike)."""
+        row, tick = window_starts(self.length, self.owner, self.dt)
+        windows = {i: np.flatnonzero(self.owner[row] == i) for i, case in enumerate(self.cases) if case.effects}
+
+        def traces(jobs: list[tuple[int, Given | None, float]]) -> list[Array]:
+            """Of an effect at a size, or of a heavier machine (None, share), in a case: [W, T, channels] each."""
+            if not jobs:
+                return []
+            mine = np.concatenate([windows[i] for i, _, _ in jobs])
+            ends = np.cumsum([len(windows[i]) for i, _, _ in jobs])
+            nominal = take(self.nominal, row[mine])
+            p, felt = {k: v.copy() for k, v in nominal.items()}, []
+            for (i, given, size), end in zip(jobs, ends, strict=True):
+                span = np.arange(end - len(windows[i]), end)
+                if given is None:
+                    for name in (n for n in BODY_MASSES if n in p):
+                        p[name][span] *= 1 + size
+                else:
+                    EVERYTHING[given.name].apply(p, span, given.joint, size, given.shape, scales[i][given.joint])
+                sd = [0.01 * s["F"] if self.cases[i].force_channel else np.inf for s in scales[i]]
+                felt += [sd[: len(self.plant.actuators)]] * len(span)
+            found = trace(
+                self.plant, p, nominal, calm, row[mine], tick[mine], self.dt, self.floor[row[mine]], np.array(felt)
+            )
+            return np.split(np.where(np.isfinite(found), found, 1e6), ends[:-1])
+
+        return alike(self.plant, self.cases, sizes, scales, traces)
+
     def _made(
-        self, i: int, record: Record, sizes: list[float], unit: list[float], scales: list[dict[str, float]]
+        self,
+        i: int,
+        record: Record,
+        sizes: list[float],
+        unit: list[float],
+        scales: list[dict[str, float]],
+        same: list[list[str]],
     ) -> Made:
         case, mine = self.cases[i], self.of[i]
         rng = np.random.default_rng((*case.entropy, 4))
@@ -283,7 +323,7 @@ class _Batch:
                 columns[f"force/{name}"] = record.force[r, :count, j] + sd * rng.standard_normal(count)
             episodes.append(columns)
         truth = []
-        for given, size, one in zip(case.effects, sizes, unit, strict=True):
+        for given, size, one, others in zip(case.effects, sizes, unit, same, strict=True):
             parameters = EVERYTHING[given.name].report(size, given.shape, scales[given.joint])
             truth.append(
                 {
@@ -293,6 +333,7 @@ class _Batch:
                     "detectable": one if np.isfinite(one) else None,
                     "multiple": size / one if np.isfinite(one) else 0.0,
                     "parameters": parameters,
+                    "alike": others,
                 }
             )
         return Made(case, episodes, truth, [float(x) for x in self.floor[mine[0]]])

@@ -55,12 +55,16 @@ def truths(label: Label) -> list[list[str]]:
 
 
 def top1(report: Report, label: Label) -> bool:
-    """Whether the verdict is right: the hidden effects by name, or a tie among equivalents and nothing else."""
-    right = truths(label)
-    if label["equivalents"] and report["verdict"] == "not_identifiable":
-        tied = ties(report)
-        return right[0] in tied and all(names in right for names in tied)
-    return named(report) in right
+    """Whether the verdict is right: the hidden effects by name, or a tie of them with what nobody could tell apart."""
+    return rightly_tied(report, label) or named(report) in truths(label)
+
+
+def rightly_tied(report: Report, label: Label) -> bool:
+    """Whether the hidden effects are in a tie, and nothing else is but equivalents and names alike on these data."""
+    tied, right = ties(report), truths(label)
+    allowed = [*right, *(sorted(names) for names in label["alike"])]
+    honest = report["verdict"] == "not_identifiable" and len(tied) > 1
+    return honest and right[0] in tied and all(names in allowed for names in tied)
 
 
 def top3(report: Report, label: Label) -> bool:
@@ -94,7 +98,12 @@ def _list(at: Any) -> list[str]:
 
 
 def f1(report: Report, label: Label) -> float:
-    """Harmonic mean of precision and recall of the names held for certain; the kindest of the equivalent truths."""
+    """Harmonic mean of precision and recall of the names held for certain; the kindest of the equivalent truths.
+
+    One for a tie that is right.
+    """
+    if rightly_tied(report, label):
+        return 1.0
     said = set(asserted(report))
     return max(2 * len(said & set(right)) / max(len(said) + len(right), 1) for right in truths(label))
 
@@ -149,6 +158,7 @@ def table(
         share("finished without an error", [r["verdict"] != "error" for r, _, _ in there], "1"),
         share("single, clear: top 1", [top1(r, y) for r, y, _ in single], ">= 0.90"),
         share("single, clear: top 3", [top3(r, y) for r, y, _ in single], ">= 0.98"),
+        share("single, clear: named, no tie", [named(r) in truths(y) for r, y, _ in single], ""),
         share("single, clear: name and place", [places_right(r, y) for r, y, _ in single], ""),
         share("single, all sizes: top 1", [top1(r, y) for r, y, _ in of("single")], ""),
         share("pairs: F1 of the set of names", [f1(r, y) for r, y, _ in both], ">= 0.80"),

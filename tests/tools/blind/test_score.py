@@ -11,7 +11,7 @@ def label(group: str, *names: str, multiple: float = 3.0, equivalents: list[list
     effects = [
         {"name": n, "at": ["j"], "multiple": multiple, "parameters": {"x": 1.0}, "joint": 0, "size": 1.0} for n in names
     ]
-    base = {"group": group, "kind": "", "effects": effects, "equivalents": equivalents or []}
+    base = {"group": group, "kind": "", "effects": effects, "equivalents": equivalents or [], "alike": []}
     return base | {"noise_level": 1, "seconds": 8.0, "plant": "slide"}
 
 
@@ -44,6 +44,18 @@ def test_equivalent_names_are_right_and_so_is_a_tie_among_them() -> None:
     assert score.top1(report("not_identifiable", ties=[["armature"], ["payload"]]), truth)
     assert score.top1(report("not_identifiable", "armature", ties=[{"effects": ["payload@carriage"]}]), truth)
     assert not score.top1(report("not_identifiable", ties=[["armature"], ["actuator_gain"]]), truth)
+
+
+def test_a_tie_is_right_only_among_what_the_data_cannot_tell() -> None:
+    truth = label("single", "sensor_gain") | {"alike": [["actuator_gain"]]}
+    assert score.top1(report("not_identifiable", "actuator_gain", ties=[["sensor_gain"]]), truth)
+    assert not score.top1(report("not_identifiable", "actuator_gain", ties=[]), truth)
+    assert not score.top1(report("not_identifiable", "sensor_gain", ties=[["actuator_gain"], ["payload"]]), truth)
+    assert not score.top1(report("effect", "actuator_gain"), truth)
+    pair = label("pair", "sensor_gain", "deadband") | {"alike": [["actuator_gain", "deadband"]]}
+    tied = report("not_identifiable", "actuator_gain", "deadband", ties=[["sensor_gain", "deadband"]])
+    assert score.f1(tied, pair) == 1.0
+    assert score.f1(tied, pair | {"alike": []}) == pytest.approx(2 / 3)
 
 
 def test_a_conventional_name_is_honest_only_with_its_ties() -> None:
