@@ -27,6 +27,7 @@ class Change:
         edits: Applied to a copy of the scene, in order.
         commands: f(ctrl [T, nu], dt) -> [T, nu], applied to the recorded commands, in order.
         delay: Seconds by which each actuator's command is late, [nu] or a number.
+        lag: Time constant of the low pass that each actuator's command goes through [s], [nu] or a number.
         frictions: f(load [M, nj]) -> level of dry friction [M, nj], set again and again while a simulation runs.
         late: Joint -> seconds by which what is read of it is old.
         reads: f(true signal [M], name) -> what is read of it; affine.
@@ -35,6 +36,7 @@ class Change:
     edits: tuple[Callable[[mujoco.MjSpec], None], ...] = ()
     commands: tuple[Callable[[Array, float], Array], ...] = ()
     delay: Array | float = 0.0
+    lag: Array | float = 0.0
     frictions: tuple[Callable[[Array], Array], ...] = ()
     late: Mapping[str, float] = field(default_factory=dict)
     reads: tuple[Callable[[Array, str], Array], ...] = ()
@@ -44,6 +46,7 @@ class Change:
             self.edits + other.edits,
             self.commands + other.commands,
             self.delay + other.delay,
+            self.lag + other.lag,
             self.frictions + other.frictions,
             {j: self.late.get(j, 0.0) + other.late.get(j, 0.0) for j in {**self.late, **other.late}},
             self.reads + other.reads,

@@ -16,6 +16,7 @@ import mujoco
 import mujoco.rollout
 import numpy as np
 from numpy.typing import NDArray
+from scipy.signal import lfilter
 
 from envs.effects import place_rotors
 from mpc_sgft.diagnose.plant import FORCE, Change, Plant
@@ -27,6 +28,7 @@ FULL = mujoco.mjtState.mjSTATE_FULLPHYSICS
 CTRL = int(mujoco.mjtState.mjSTATE_CTRL)
 FORCED = CTRL | int(mujoco.mjtState.mjSTATE_QFRC_APPLIED)
 THREADS = int(os.environ.get("OMP_NUM_THREADS", len(os.sched_getaffinity(0))))
+MIN_LAG = 1e-5  # [s] faster than this is no lag
 EXPLODED = 1e6  # predictions are clipped here, so that an unstable candidate is bad, not infinite
 
 
@@ -218,19 +220,20 @@ class Replayer:
 
     def _ctrl(self, change: Change) -> Array:
         """Mean command of each physics step of each window, [W, N, nu]."""
-        late = np.broadcast_to(np.asarray(change.delay, float), (len(self.plant.actuators),))
-        plain = not change.commands and not late.any()
+        size = len(self.plant.actuators)
+        late, lag = (np.broadcast_to(np.asarray(x, float), (size,)) for x in (change.delay, change.lag))
+        plain = not change.commands and not late.any() and not lag.any()
         if plain and self._nominal_ctrl is not None:
             return self._nominal_ctrl
-        out = np.empty((len(self.windows.start), self.steps, len(late)))
+        out = np.empty((len(self.windows.start), self.steps, size))
         edges = self.step_times()[:, :, None] + np.array([-self.half, self.h - self.half])
         for i, episode in enumerate(self.episodes):
             ctrl = episode.ctrl
             for command in change.commands:
                 ctrl = command(ctrl, episode.dt)
             mine = np.flatnonzero(self.windows.episode == i)
-            for a in range(len(late)):
-                out[mine, :, a] = _held_mean(ctrl[:, a], episode.dt, edges[mine] - late[a])
+            for a in range(size):
+                out[mine, :, a] = held_mean(ctrl[:, a], episode.dt, edges[mine] - late[a], lag[a])
         if plain:
             self._nominal_ctrl = out
         return out
@@ -278,10 +281,22 @@ def _at(values: Array, position: NDArray[Any]) -> Array:
     return np.moveaxis(values[rows, :, low], 2, 1) * (1 - part) + np.moveaxis(values[rows, :, low + 1], 2, 1) * part
 
 
-def _held_mean(u: Array, dt: float, edges: Array) -> Array:
-    """Mean of a held command [T] over intervals [..., 2] of time since the first sample; constant beyond the ends."""
+def held_mean(u: Array, dt: float, edges: Array, lag: float = 0.0) -> Array:
+    """Mean of a held command [T] over intervals [..., 2] of time since the first sample; constant beyond the ends.
+
+    Args:
+        u: The command.
+        dt: Seconds for which each is held.
+        edges: Beginning and end of the intervals [s].
+        lag: Time constant of a first-order low pass that it goes through, exactly [s].
+    """
     total = np.concatenate([[0.0], np.cumsum(u)]) * dt
     x = edges / dt
     inside = np.interp(x, np.arange(len(total)), total)
     inside = inside + np.minimum(x, 0) * u[0] * dt + np.maximum(x - len(u), 0) * u[-1] * dt
+    if lag > MIN_LAG:  # lag dy/dt = u - y
+        keep = np.exp(-dt / lag)
+        y, _ = lfilter([0.0, 1 - keep], [1.0, -keep], u, zi=[u[0]])  # at the samples
+        k = np.clip(np.floor(x), 0, len(u) - 1).astype(int)
+        inside = inside - lag * (u[k] + (y - u)[k] * np.exp(-np.maximum(edges - k * dt, 0) / lag))
     return (inside[..., 1] - inside[..., 0]) / (edges[..., 1] - edges[..., 0])

@@ -9,7 +9,7 @@ import pytest
 from mpc_sgft.diagnose.library import candidates, enrich, make_term
 from mpc_sgft.diagnose.plant import Change, Plant
 from mpc_sgft.diagnose.record import Episode
-from mpc_sgft.diagnose.replay import Replayer, _held_mean
+from mpc_sgft.diagnose.replay import Replayer, held_mean
 from mpc_sgft.diagnose.smooth import smooth
 from mpc_sgft.diagnose.table import TABLE, Scales
 
@@ -35,10 +35,10 @@ def test_a_right_model_predicts_to_the_second_order(plant) -> None:
     assert np.abs(error).max() < 3e-6  # the first order alone would be h a t / 2 = 5e-4 m
 
 
-def test_held_mean_by_hand() -> None:
+def testheld_mean_by_hand() -> None:
     u = np.array([1.0, 3.0])  # held on [0, 1) and [1, 2)
     edges = np.array([[0.0, 1.0], [0.5, 1.5], [1.5, 3.0], [-1.0, 0.5]])
-    np.testing.assert_allclose(_held_mean(u, 1.0, edges), [1.0, 2.0, 3.0, 1.0])
+    np.testing.assert_allclose(held_mean(u, 1.0, edges), [1.0, 2.0, 3.0, 1.0])
 
 
 def test_a_delay_reaches_back_before_the_window(plant) -> None:
@@ -128,7 +128,7 @@ def test_a_richer_effect_starts_as_the_simpler_one(plant) -> None:
         ("stribeck_friction", "coulomb_friction", 0.3),
     ):
         old, new = (make_term(plant, n, "x", Scales()) for n in (simple, rich))
-        a, b = replayer.simulate([old.build(np.array([value])), new.build(enrich(new, old, np.array([value])))])
+        a, b = replayer.simulate([old.build(np.array([value])), new.build(enrich(new, old, np.array([value]))[0])])
         np.testing.assert_allclose(a, b, atol=1e-7)
 
 
