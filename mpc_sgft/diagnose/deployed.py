@@ -15,15 +15,17 @@ import yaml
 from envs.effects.base import Effect
 from mpc_sgft.diagnose.chain import Chain, Prediction, effects_of
 from mpc_sgft.diagnose.deployment import Deployment, read_deployment
+from mpc_sgft.diagnose.entry import Entry
 from mpc_sgft.diagnose.fit import fit
 from mpc_sgft.diagnose.motion import SUB
 from mpc_sgft.diagnose.name import Verdict, judge_entries
 from mpc_sgft.diagnose.outlook import next_experiment
-from mpc_sgft.diagnose.prepare import BLOCKS, Setup, split
+from mpc_sgft.diagnose.prepare import Setup, cut, split
 from mpc_sgft.diagnose.record import Array
 from mpc_sgft.diagnose.report import Report
 from mpc_sgft.diagnose.run import candidate_rows, effect_rows, reduction
-from mpc_sgft.diagnose.search import Effort, Entry, search
+from mpc_sgft.diagnose.screen import Effort
+from mpc_sgft.diagnose.search import search
 from mpc_sgft.diagnose.suspects import gap_of, suspects
 from mpc_sgft.errors import UserError
 from mpc_sgft.log import progress as bar_of
@@ -99,7 +101,7 @@ def prepare(deployment: Deployment, window: float | None, held_out: float | Sequ
     length = LENGTH if window is None else max(1, round(window / dt))
     chain = Chain(deployment, length, MOST)
     fitted, held = split(replayer_view(chain), held_out)
-    blocks = np.minimum(np.arange(len(fitted)) * BLOCKS // len(fitted), BLOCKS - 1)
+    blocks = cut(len(fitted), 1, len(fitted) + len(held))
     floor = np.concatenate(
         [chain.observation_floor, np.full(chain.drive.shape[2], chain.drive_scale), chain.joint_floor]
     )

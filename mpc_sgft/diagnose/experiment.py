@@ -7,11 +7,11 @@ from collections.abc import Callable, Sequence
 import mujoco
 import numpy as np
 
+from mpc_sgft.diagnose.entry import Entry
 from mpc_sgft.diagnose.fit import change_of
 from mpc_sgft.diagnose.plant import Change
 from mpc_sgft.diagnose.prepare import Setup
 from mpc_sgft.diagnose.record import Array
-from mpc_sgft.diagnose.search import Entry
 
 WINDOWS = 16  # to simulate
 LOAD = 0.5  # of the body's mass

@@ -243,9 +243,14 @@ class _Flat:
         return np.where(x + step > self.high, -step, step)
 
 
+def part_edges(points: int, parts: int) -> Index:
+    """Where equal parts of so many points begin and end, [parts + 1]."""
+    return np.linspace(0, points, parts + 1).astype(int)
+
+
 def by_parts(squares: Array, parts: int) -> Array:
     """Means of [W, m] over equal parts of each row, one after the other, [W parts]."""
-    edges = np.linspace(0, squares.shape[1], parts + 1).astype(int)
+    edges = part_edges(squares.shape[1], parts)
     return (np.add.reduceat(squares, edges[:-1], axis=1) / np.diff(edges)).ravel()
 
 
@@ -254,24 +259,28 @@ def window_errors(problem: Residuals, f: Fit, pick: Index, parts: int = 1) -> Ar
     return by_parts(problem.residuals(f.terms, [f.values], pick)[0] ** 2, parts)
 
 
-def left_out_errors(f: Fit, blocks: Index, parts: int = 1) -> Array:
-    """Error of each fitted window when its block is left out of the fit, to first order, [W parts].
+def block_of_each(blocks: Index, points: int) -> Index:
+    """Block of every residual [W, m], from that of every part of each window [W, parts]."""
+    return np.repeat(blocks, np.diff(part_edges(points, blocks.shape[1])), axis=1)
+
+
+def left_out_errors(f: Fit, blocks: Index) -> Array:
+    """Error of each part of each fitted window when its block is left out of the fit, to first order, [W parts].
 
     Args:
         f: The fit.
-        blocks: Block of each fitted window, [W].
-        parts: Of each window, that are judged apart.
+        blocks: Block of each part of each fitted window, [W, parts].
     """
-    count = f.J.shape[-1]
+    count, parts = f.J.shape[-1], blocks.shape[1]
     if not count:
         return by_parts(f.r**2, parts)
-    weight = f.weights
-    per = np.einsum("w,wmp,wmq->wpq", weight, f.J, f.J, optimize=True)
-    total, out = per.sum(0), np.empty(f.r.shape)
+    of, root = block_of_each(blocks, f.r.shape[1]), np.sqrt(f.weights)[:, None]
+    J, r, out = f.J * root[..., None], f.r * root, np.empty(f.r.shape)
+    total = np.einsum("wmp,wmq->pq", J, J, optimize=True)
     ridge = 1e-9 * np.eye(count) * max(float(np.trace(total)) / count, 1e-30)
-    for b in np.unique(blocks):
-        mine = blocks == b
-        rest = total - per[mine].sum(0) + ridge
-        moved = np.linalg.solve(rest, np.einsum("w,wmp,wm->p", weight[mine], f.J[mine], f.r[mine], optimize=True))
+    for b in np.unique(of):
+        mine = of == b
+        rest = total - J[mine].T @ J[mine] + ridge
+        moved = np.linalg.solve(rest, J[mine].T @ r[mine])
         out[mine] = (f.r[mine] + f.J[mine] @ moved) ** 2
     return by_parts(out, parts)

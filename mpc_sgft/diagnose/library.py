@@ -201,11 +201,14 @@ def includes(rich: Term, simple: Term) -> bool:
     return simple.effect in INCLUDES.get(rich.effect, {}) and simple.at == rich.at
 
 
-def enrich(rich: Term, simple: Term, value: Array) -> Array:
-    """The richer effect's parameters that do exactly what the simpler one does."""
+def enrich(rich: Term, simple: Term, value: Array) -> list[Array]:
+    """Parameters with which the richer effect does what the simpler one does, for each start of those that idle."""
     mapping = INCLUDES[rich.effect][simple.effect]
-    out = np.array([s if n in HIDDEN else z for n, s, z in zip(rich.names, rich.starts[0], rich.neutral, strict=True)])
-    for i, name in enumerate(rich.names):
-        if name in mapping:
-            out[i] = value[simple.names.index(mapping[name])]
-    return np.clip(out, rich.low, rich.high)
+    out = []
+    for start in rich.starts:
+        x = np.array([s if n in HIDDEN else z for n, s, z in zip(rich.names, start, rich.neutral, strict=True)])
+        for i, name in enumerate(rich.names):
+            if name in mapping:
+                x[i] = value[simple.names.index(mapping[name])]
+        out.append(np.clip(x, rich.low, rich.high))
+    return [x for i, x in enumerate(out) if not any(np.array_equal(x, y) for y in out[:i])]

@@ -9,11 +9,11 @@ import numpy as np
 from scipy import stats
 
 from mpc_sgft.diagnose import judge
+from mpc_sgft.diagnose.entry import Entry, entry
 from mpc_sgft.diagnose.fit import fit
 from mpc_sgft.diagnose.flexible import Flexible
 from mpc_sgft.diagnose.prepare import ABOVE_NOISE, NOISE, Setup
 from mpc_sgft.diagnose.record import Array
-from mpc_sgft.diagnose.search import Entry, entry
 from mpc_sgft.diagnose.table import EQUIVALENT, Equivalence
 
 UNEXPLAINED = 0.05  # share of what any model can explain that named effects may miss before the answer is "unknown"

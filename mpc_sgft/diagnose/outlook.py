@@ -8,9 +8,9 @@ import numpy as np
 
 from envs.backends.sim import SimBackend
 from mpc_sgft.diagnose.chain import RESOLUTION, Chain, effects_of
+from mpc_sgft.diagnose.entry import Entry
 from mpc_sgft.diagnose.experiment import best_of, separation
 from mpc_sgft.diagnose.record import Array
-from mpc_sgft.diagnose.search import Entry
 
 STARTS = 4  # simulated episodes for each proposal
 TIED = 3  # candidates that are compared

@@ -9,6 +9,7 @@ from typing import Any, Generic, TypeVar
 import mujoco
 import numpy as np
 
+from mpc_sgft.diagnose import judge
 from mpc_sgft.diagnose.fit import Fit, Problem, Residuals, by_parts, change_of, fit
 from mpc_sgft.diagnose.library import Term
 from mpc_sgft.diagnose.plant import Plant, joint_of
@@ -38,7 +39,7 @@ class Setup(Generic[P]):
     Attributes:
         problem: Residuals of structures.
         fitted, held: Windows to fit to, and windows never fitted.
-        blocks: Contiguous block of each fitted window.
+        blocks: Contiguous block of each part of each fitted window, [W, parts].
         baseline: The nominal model with uncertain quantities refitted.
         noise, floor: Of each signal, of the sensor and of the simulator (its median), [S].
         quiet: An error below which nothing is left to explain.
@@ -98,14 +99,25 @@ def prepare(
     floor = simulator_floor(plant, episodes, replayer, nominal, base.values)
     problem = _problem(replayer, noise, floor, nominal, base.values)
     base = fit(problem, nominal, base.values, fitted)
-    blocks = np.minimum(np.arange(len(fitted)) * BLOCKS // len(fitted), BLOCKS - 1)
     parts = max(1, -(-UNITS // len(replayer.windows.start)))
+    blocks = cut(len(fitted), parts, len(replayer.windows.start))
     least = by_parts(problem.floor_share[np.concatenate([fitted, held])], parts)  # less says nothing of the machine
 
     def judged(errors: Array) -> Array:
         return np.log1p(np.maximum(errors, least))
 
     return Setup(problem, fitted, held, blocks, base, noise, np.median(floor[0], (0, 1)), judged, NOISE + QUIET, parts)
+
+
+def cut(fitted: int, parts: int, windows: int) -> Index:
+    """Block of each part of each fitted window, [W, parts]: neighbouring windows, or parts where windows are few.
+
+    One window may then hold all that shows an effect; the rest of it has to foretell what is left out.
+    """
+    if windows < judge.FEW_WINDOWS:
+        return np.arange(fitted * parts).reshape(fitted, parts)
+    block = np.minimum(np.arange(fitted) * BLOCKS // fitted, BLOCKS - 1)
+    return np.repeat(block[:, None], parts, axis=1)
 
 
 def split(replayer: Any, held_out: float | Sequence[str] | None) -> tuple[Index, Index]:

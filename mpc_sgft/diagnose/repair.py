@@ -7,10 +7,10 @@ from pathlib import Path
 import mujoco
 
 from envs.effects.base import Effect, load
+from mpc_sgft.diagnose.entry import Entry
 from mpc_sgft.diagnose.library import as_gap, settings
 from mpc_sgft.diagnose.nominal import scale
 from mpc_sgft.diagnose.plant import FORCE, Plant
-from mpc_sgft.diagnose.search import Entry
 
 
 def repaired_spec(plant: Plant, best: Entry) -> tuple[mujoco.MjSpec, list[str]]:

@@ -12,6 +12,7 @@ import numpy as np
 
 from mpc_sgft.diagnose import judge, repair
 from mpc_sgft.diagnose.check import episodes
+from mpc_sgft.diagnose.entry import Entry
 from mpc_sgft.diagnose.experiment import next_experiment
 from mpc_sgft.diagnose.fit import change_of
 from mpc_sgft.diagnose.flexible import flexible_fit
@@ -25,7 +26,7 @@ from mpc_sgft.diagnose.prepare import Setup, prepare, scales
 from mpc_sgft.diagnose.record import Array, Episode, files, read_table
 from mpc_sgft.diagnose.replay import Replayer
 from mpc_sgft.diagnose.report import MAX_CANDIDATES, Report
-from mpc_sgft.diagnose.search import Entry, search
+from mpc_sgft.diagnose.search import search
 from mpc_sgft.diagnose.table import TABLE
 from mpc_sgft.errors import UserError
 from mpc_sgft.log import progress as bar_of

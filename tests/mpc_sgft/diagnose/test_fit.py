@@ -10,6 +10,7 @@ from mpc_sgft.diagnose import judge
 from mpc_sgft.diagnose.fit import by_parts, fit, left_out_errors
 from mpc_sgft.diagnose.library import Term
 from mpc_sgft.diagnose.plant import Change
+from mpc_sgft.diagnose.prepare import cut
 
 SLOPE = Term(
     effect="slope",
@@ -45,7 +46,7 @@ def test_a_wild_window_does_not_pull_the_fit() -> None:
     f = fit(line, [SLOPE], [SLOPE.starts[0]], every)
     least_squares = float((line.x * line.y).sum() / (line.x**2).sum())
     assert abs(f.values[0][0] - 2.0) < 0.05 < 0.5 < abs(least_squares - 2.0)
-    errors = left_out_errors(f, every // 3)
+    errors = left_out_errors(f, every[:, None] // 3)
     assert errors[:-1].max() < 2.5 and errors[-1] > 1000  # and it is judged as it is
 
 
@@ -57,11 +58,23 @@ def test_a_gain_in_a_few_windows_is_credible_and_one_in_a_single_window_is_not()
     assert not judge.credible(before, before - 0.01, rng)  # real, and too small for a name
 
 
-def test_a_gain_in_all_parts_of_one_window_is_not_credible() -> None:
+def test_a_gain_in_one_of_many_windows_is_not_credible_but_in_several_parts_of_one_of_few_it_is() -> None:
     rng = np.random.default_rng(0)
-    before, one, two = np.zeros(24), np.zeros(24), np.zeros(24)
-    one[:6], two[3:9] = -1.0, -1.0  # windows of six parts
+    before, one, two, part = np.zeros(48), np.zeros(48), np.zeros(48), np.zeros(24)
+    one[:6], two[3:9] = -2.0, -2.0  # windows of six parts
     assert judge.credible(before, two, rng, parts=6) and not judge.credible(before, one, rng, parts=6)
+    assert judge.credible(before[:24], one[:24], rng, parts=6)
+    part[0] = -12.0
+    assert not judge.credible(before[:24], part, rng, parts=6)
+
+
+def test_where_windows_are_few_the_rest_of_one_foretells_a_part_that_is_left_out() -> None:
+    line, pick = Line(), np.arange(4)
+    line.x[:3] = 0.0  # the last window alone shows the slope
+    line.y[:3] = np.random.default_rng(1).normal(size=(3, 40))
+    f = fit(line, [SLOPE], [SLOPE.starts[0]], pick)
+    whole, parts = (left_out_errors(f, cut(4, 4, windows)) for windows in (20, 4))
+    assert whole[12:].max() > 20 > 3 > parts.max()
 
 
 def test_parts_by_hand() -> None:

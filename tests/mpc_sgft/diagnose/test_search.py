@@ -7,12 +7,14 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
+from mpc_sgft.diagnose.entry import entry
 from mpc_sgft.diagnose.fit import fit
 from mpc_sgft.diagnose.library import Term, as_gap, candidates, settings
 from mpc_sgft.diagnose.name import gains
 from mpc_sgft.diagnose.plant import Change, Plant
 from mpc_sgft.diagnose.prepare import NOISE, Setup
-from mpc_sgft.diagnose.search import Effort, entry, search, swaps
+from mpc_sgft.diagnose.screen import Effort
+from mpc_sgft.diagnose.search import search, swaps
 from mpc_sgft.diagnose.table import Scales
 
 PENDULUM = """<mujoco><worldbody><body><joint name="hinge" axis="0 1 0"/><geom size="0.05" pos="0 0 -0.4" mass="1"/>
@@ -48,7 +50,7 @@ def found(pairs: int) -> list[set[str]]:
     problem, fitted = Lines(), np.arange(18)
     base = fit(problem, [], [], fitted)
     none = np.zeros(1)
-    setup = Setup(problem, fitted, np.arange(18, 24), fitted // 3, base, none, none, np.log1p, NOISE)
+    setup = Setup(problem, fitted, np.arange(18, 24), fitted[:, None] // 3, base, none, none, np.log1p, NOISE)
     terms = [term(name) for name in "abcdefghxy"]
     entries = search(setup, terms, 2, np.random.default_rng(0), effort=Effort(beam=(1,), full=(1, 1, 1), pairs=pairs))
     return [set(e.names) for e in entries if e.error < NOISE + 0.1]
@@ -62,7 +64,9 @@ def test_a_delay_is_exchanged_for_a_lag_but_not_where_there_is_one() -> None:
     problem, fitted, none = Lines(), np.arange(18), np.zeros(1)
     terms = [term("actuator_delay"), term("actuator_lag")]
     problem.columns |= {"actuator_delay": problem.columns["x"], "actuator_lag": problem.columns["y"]}
-    setup = Setup(problem, fitted, np.arange(18, 24), fitted // 3, fit(problem, [], [], fitted), none, none, np.log1p)
+    setup = Setup(
+        problem, fitted, np.arange(18, 24), fitted[:, None] // 3, fit(problem, [], [], fitted), none, none, np.log1p
+    )
     alone, both = (entry(setup, fit(problem, t, [none] * len(t), fitted)) for t in (terms[:1], terms))
     assert [e.names for e in swaps(setup, {alone.key: alone}, terms, Effort()).values()] == [["actuator_lag"]]
     assert not swaps(setup, {both.key: both}, terms, Effort())
@@ -71,7 +75,14 @@ def test_a_delay_is_exchanged_for_a_lag_but_not_where_there_is_one() -> None:
 def test_where_noise_alone_is_left_an_effect_must_gain_more() -> None:
     problem, fitted, none = Lines(), np.arange(18), np.zeros(1)
     setup = Setup(
-        problem, fitted, np.arange(18, 24), fitted // 3, fit(problem, [], [], fitted), none, none, quiet=NOISE + 0.1
+        problem,
+        fitted,
+        np.arange(18, 24),
+        fitted[:, None] // 3,
+        fit(problem, [], [], fitted),
+        none,
+        none,
+        quiet=NOISE + 0.1,
     )
     base, rng = entry(setup, setup.baseline), np.random.default_rng(0)
     scatter = np.abs(0.01 * rng.normal(size=24))

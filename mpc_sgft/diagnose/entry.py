@@ -1,0 +1,69 @@
+"""A set of effects, fitted and judged."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from mpc_sgft.diagnose.fit import Fit, left_out_errors, window_errors
+from mpc_sgft.diagnose.library import Term
+from mpc_sgft.diagnose.prepare import Setup
+from mpc_sgft.diagnose.record import Array
+from mpc_sgft.diagnose.table import INCLUDES
+
+SEEN = 1e-3  # a parameter whose derivative is smaller than this share of its effect's largest changes nothing
+
+
+class Entry(NamedTuple):
+    """A set of effects, fitted and judged.
+
+    Attributes:
+        fit: Nominal terms and effects.
+        effects: Number of effects; they are the last terms.
+        errors: Error of every part of every window when that is not fitted, [(W fitted + W held) parts].
+        complexity: Parameters of the effects that change anything.
+    """
+
+    fit: Fit
+    effects: int
+    errors: Array
+    complexity: int
+
+    @property
+    def terms(self) -> tuple[Term, ...]:
+        return self.fit.terms[len(self.fit.terms) - self.effects :]
+
+    @property
+    def values(self) -> tuple[Array, ...]:
+        return self.fit.values[len(self.fit.terms) - self.effects :]
+
+    @property
+    def names(self) -> list[str]:
+        return [t.label for t in self.terms]
+
+    @property
+    def key(self) -> frozenset[str]:
+        return frozenset(t.label + str(t.fixed) for t in self.terms)
+
+    @property
+    def idle(self) -> int:
+        """Parameters that change nothing here, of effects that are there to do more than simpler ones."""
+        rich = any(t.effect in INCLUDES for t in self.terms)
+        return sum(len(t.size) for t in self.terms) - self.complexity if rich else 0
+
+    @property
+    def error(self) -> float:
+        return float(self.errors.mean())
+
+
+def entry(setup: Setup[Any], f: Fit) -> Entry:
+    """Judge a fit on all windows: fitted ones by leaving out their block, the others as they are."""
+    nominal = len(setup.baseline.terms)
+    left_out = left_out_errors(f, setup.blocks)
+    errors = np.concatenate([left_out, window_errors(setup.problem, f, setup.held, setup.parts)])
+    errors = setup.judged(errors)
+    ends = np.cumsum([len(t.size) for t in f.terms])
+    norms = np.split(np.sqrt((f.J**2).sum((0, 1))), ends[:-1])[nominal:]  # of each effect's parameters
+    seen = sum(int((own > SEEN * max(float(own.max()), 1e-12)).sum()) for own in norms if len(own))
+    return Entry(f, len(f.terms) - nominal, errors, seen)

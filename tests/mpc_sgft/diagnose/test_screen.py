@@ -1,0 +1,67 @@
+"""A start that is far too large is cut down, and a richer effect starts where the simpler one ended."""
+
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+import pytest
+
+from mpc_sgft.diagnose import screen as screening
+from mpc_sgft.diagnose.entry import entry
+from mpc_sgft.diagnose.fit import Fit, fit
+from mpc_sgft.diagnose.library import Term, candidates, enrich
+from mpc_sgft.diagnose.plant import Plant
+from mpc_sgft.diagnose.prepare import Setup
+from mpc_sgft.diagnose.screen import proposals, screen
+from mpc_sgft.diagnose.table import Scales
+from tests.mpc_sgft.diagnose.test_search import PENDULUM, term
+
+TRUE = 2e-4  # of the typical size
+
+
+class Steep:
+    """One effect, tame at its true size and wild at its typical one."""
+
+    blocks, step, pattern = 20, 1e-5, ()
+
+    def __init__(self) -> None:
+        rng = np.random.default_rng(0)
+        self.column = rng.normal(size=(24, 20))
+        self.y = self.shape(TRUE) * self.column + 0.1 * rng.normal(size=self.column.shape)
+
+    def shape(self, x: float) -> float:
+        return 5e3 * x + (5e3 * x) ** 3
+
+    def residuals(self, terms: Sequence[Term], points: Sequence[Sequence[np.ndarray]], pick: np.ndarray) -> np.ndarray:
+        size = [sum(float(v[0]) for v in p) for p in points]
+        return np.stack([(self.shape(x) * self.column - self.y)[pick] for x in size])
+
+
+@pytest.mark.parametrize(("shrinks", "found"), [(3, True), (0, False)])
+def test_an_effect_far_below_its_typical_size_is_seen(
+    monkeypatch: pytest.MonkeyPatch, shrinks: int, found: bool
+) -> None:
+    monkeypatch.setattr(screening, "SHRINKS", shrinks)
+    problem, fitted, none = Steep(), np.arange(18), np.zeros(1)
+    base = fit(problem, [], [], fitted)
+    setup = Setup(problem, fitted, np.arange(18, 24), fitted[:, None] // 3, base, none, none, np.log1p)
+    parent = entry(setup, base)
+    ranked, _ = screen(setup, parent, proposals(parent, [term("a")], 1, (1.0, 0.1, 0.01)), 6)
+    assert (0.5 < float(ranked[0].start[0][0]) / TRUE < 2.0) == found
+
+
+def test_a_richer_effect_starts_where_the_simpler_one_ended_whatever_its_idle_parameters() -> None:
+    plant = Plant(mujoco.MjSpec.from_string(PENDULUM))
+    dry, rich = candidates(plant, {"hinge": Scales(force=2.0, speed=1.0)}, ["coulomb_friction", "stribeck_friction"])
+    starts = enrich(rich, dry, np.array([0.7]))
+    assert rich.names == ("coulomb", "excess", "velocity")
+    np.testing.assert_allclose(starts, [[0.7, 0.0, 0.1], [0.7, 0.0, 0.5]])
+
+
+def test_every_effect_of_a_set_counts_however_much_another_shows() -> None:
+    problem, fitted, none = Steep(), np.arange(18), np.zeros(1)
+    base = fit(problem, [], [], fitted)
+    setup = Setup(problem, fitted, np.arange(18, 24), fitted[:, None] // 3, base, none, none, np.log1p)
+    J = np.stack([1e6 * problem.column[:18], problem.column[18:].repeat(3, 0)], -1)
+    both = Fit((term("a"), term("b")), (np.array([TRUE]), np.zeros(1)), base.r, J)
+    assert entry(setup, both).complexity == 2
