@@ -213,7 +213,10 @@ class Replayer:
                 columns.append(_at(qvel[..., i], (times + self.half - late[:, i, None]) / self.h))
             elif kind == "force":  # of the command from this sample on, and from the actuator's to its joint's
                 felt = m.actuator(part).gear[0] * sensed[..., int(m.sensor(f"{FORCE}{part}").adr[0])]
-                columns.append(_at(felt, (times + 2 * self.half) / self.h))
+                after = _at(felt, times / self.h + (1.0 if self.half else 0.0))
+                if self.half and self.dt > 3 * self.h:  # back to the sample's own state, under its new command
+                    after = 2 * after - _at(felt, times / self.h + 2.0)
+                columns.append(after)
             else:
                 columns.append(_at(sensed[..., int(m.sensor(part).adr[0])], times / self.h))
         return np.stack(columns, -1)
