@@ -58,11 +58,17 @@ class Entry(NamedTuple):
 
 
 def entry(setup: Setup[Any], f: Fit) -> Entry:
-    """Judge a fit on all windows: fitted ones by leaving out their block, the others as they are."""
+    """Judge a fit on all windows: fitted ones by leaving out their block, the others as they are.
+
+    One of a few windows may hold all that shows an effect. Then its parts are left out one by one, if the rest of it
+    foretells them but for noise.
+    """
     nominal = len(setup.baseline.terms)
-    left_out = left_out_errors(f, setup.blocks)
-    errors = np.concatenate([left_out, window_errors(setup.problem, f, setup.held, setup.parts)])
-    errors = setup.judged(errors)
+    held = window_errors(setup.problem, f, setup.held, setup.parts)
+    each = np.arange(setup.blocks.size).reshape(setup.blocks.shape)
+    by_part, errors = (setup.judged(np.concatenate([left_out_errors(f, b), held])) for b in (each, setup.blocks))
+    if setup.one_window(by_part):
+        errors = by_part
     ends = np.cumsum([len(t.size) for t in f.terms])
     norms = np.split(np.sqrt((f.J**2).sum((0, 1))), ends[:-1])[nominal:]  # of each effect's parameters
     seen = sum(int((own > SEEN * max(float(own.max()), 1e-12)).sum()) for own in norms if len(own))

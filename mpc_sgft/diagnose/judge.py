@@ -15,7 +15,6 @@ TIE_LEVEL = 0.90  # ... while a rival of the same size must be worse with this o
 TIE_GAIN = 0.01  # ... by more than this in log(1 + e)
 TIE_ODDS = 20.0  # ... or be so much less likely, where what is left is noise
 FEW = 12  # windows
-FEW_WINDOWS = 7  # fewer: their parts are left out and counted one by one
 MIN_GAIN = 0.05  # in log(1 + e): a gain below is not worth a name ...
 MIN_SHARE = 0.05  # ... nor one below this share of the error
 ELSEWHERE = 0.02  # in log(1 + e), left of a gain without its best window: one window may have gone wrong by itself
@@ -48,7 +47,14 @@ def gain(worse: Array, better: Array, level: float, rng: np.random.Generator) ->
     return Interval(mean, min(float(low), mean - half), max(float(high), mean + half))
 
 
-def credible(worse: Array, better: Array, rng: np.random.Generator, parts: int = 1, least: float = MIN_GAIN) -> bool:
+def credible(
+    worse: Array,
+    better: Array,
+    rng: np.random.Generator,
+    parts: int = 1,
+    least: float = MIN_GAIN,
+    one_window: bool = False,
+) -> bool:
     """Whether the gain is real, in more than one window, and large enough to matter.
 
     Args:
@@ -56,12 +62,11 @@ def credible(worse: Array, better: Array, rng: np.random.Generator, parts: int =
         rng: For the bootstrap.
         parts: Of each window.
         least: Gain that matters.
+        one_window: Whether several parts of one window will do.
     """
     g = gain(worse, better, 2 * GAIN_LEVEL - 1, rng)
-    windows = (worse - better).reshape(-1, parts).mean(1)
-    if len(windows) < FEW_WINDOWS:
-        windows = worse - better
-    elsewhere = (windows.sum() - windows.max()) / max(len(windows) - 1, 1)
+    drops = (worse - better).reshape(-1, 1 if one_window else parts).mean(1)
+    elsewhere = (drops.sum() - drops.max()) / max(len(drops) - 1, 1)
     return g.low > 0 and g.mean > max(least, MIN_SHARE * float(worse.mean())) and bool(elsewhere > ELSEWHERE)
 
 

@@ -56,7 +56,7 @@ def gains(setup: Setup[Any], small: Entry, large: Entry, rng: np.random.Generato
     """Whether a larger set is credibly better; where noise alone is left, one more effect must gain more."""
     noise_alone = small.error < setup.quiet or bool(small.effects) and settled(small)
     least = NEXT_GAIN if noise_alone else judge.MIN_GAIN
-    return judge.credible(small.errors, large.errors, rng, setup.parts, least)
+    return judge.credible(small.errors, large.errors, rng, setup.parts, least, setup.one_window(large.errors))
 
 
 def prune(setup: Setup[Any], best: Entry, entries: list[Entry], rng: np.random.Generator) -> Entry:

@@ -9,7 +9,6 @@ from typing import Any, Generic, TypeVar
 import mujoco
 import numpy as np
 
-from mpc_sgft.diagnose import judge
 from mpc_sgft.diagnose.fit import Fit, Problem, Residuals, by_parts, change_of, fit
 from mpc_sgft.diagnose.library import Term
 from mpc_sgft.diagnose.plant import Plant, joint_of
@@ -22,6 +21,7 @@ from mpc_sgft.errors import UserError
 WINDOW = 1.0  # [s] where the data allow it
 MIN_WINDOWS = 4  # shorter windows rather than fewer
 UNITS = 24  # parts of windows to compare sets on, at least
+FEW_WINDOWS = 7  # fewer: one may hold all that shows an effect
 BLOCKS = 8  # into which the fitted windows are split for leaving out
 NOISE = float(np.log(2.0))  # log(1 + e) of a window whose error is noise alone, e = 1
 QUIET = 0.1  # in log(1 + e): below this above the noise's, no further effect is searched for
@@ -57,6 +57,14 @@ class Setup(Generic[P]):
     judged: Callable[[Array], Array] = field(default=np.asarray)
     quiet: float = -np.inf
     parts: int = 1
+
+    def one_window(self, errors: Array) -> bool:
+        """Whether several parts of one window may show an effect: where windows are few, and noise alone is left.
+
+        Args:
+            errors: With the effect, of every part of every window.
+        """
+        return len(errors) < FEW_WINDOWS * self.parts and float(errors.mean()) < NOISE + ABOVE_NOISE
 
 
 def default_window(episodes: Sequence[Episode], joints: Sequence[str]) -> float:
@@ -100,7 +108,7 @@ def prepare(
     problem = _problem(replayer, noise, floor, nominal, base.values)
     base = fit(problem, nominal, base.values, fitted)
     parts = max(1, -(-UNITS // len(replayer.windows.start)))
-    blocks = cut(len(fitted), parts, len(replayer.windows.start))
+    blocks = cut(len(fitted), parts)
     least = by_parts(problem.floor_share[np.concatenate([fitted, held])], parts)  # less says nothing of the machine
 
     def judged(errors: Array) -> Array:
@@ -109,13 +117,8 @@ def prepare(
     return Setup(problem, fitted, held, blocks, base, noise, np.median(floor[0], (0, 1)), judged, NOISE + QUIET, parts)
 
 
-def cut(fitted: int, parts: int, windows: int) -> Index:
-    """Block of each part of each fitted window, [W, parts]: neighbouring windows, or parts where windows are few.
-
-    One window may then hold all that shows an effect; the rest of it has to foretell what is left out.
-    """
-    if windows < judge.FEW_WINDOWS:
-        return np.arange(fitted * parts).reshape(fitted, parts)
+def cut(fitted: int, parts: int) -> Index:
+    """Block of each part of each fitted window, [W, parts]: of neighbouring windows."""
     block = np.minimum(np.arange(fitted) * BLOCKS // fitted, BLOCKS - 1)
     return np.repeat(block[:, None], parts, axis=1)
 

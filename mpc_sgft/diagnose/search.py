@@ -50,10 +50,12 @@ def search(
                 pairs = couple(parent, samples, setup, effort) if max_effects > 1 and effort.pairs else []
             for proposal in sharpen(setup, ranked[: 2 * full], effort)[:full]:
                 key = key_of(setup, proposal.terms)
-                if key in found or key in new:
+                richer = len(proposal.terms) == len(parent.fit.terms)  # from a simpler set's optimum: once more
+                if key in new or key in found and not richer:
                     continue
-                f = fit(setup.problem, proposal.terms, proposal.start, setup.fitted, effort.last)
-                new[key] = entry(setup, f)
+                fitted = entry(setup, fit(setup.problem, proposal.terms, proposal.start, setup.fitted, effort.last))
+                if key not in found or fitted.error < found[key].error:
+                    new[key] = fitted
         if level == 1:
             for proposal in sharpen(setup, [p for p in pairs if key_of(setup, p.terms) not in new], effort)[:full]:
                 f = fit(setup.problem, proposal.terms, proposal.start, setup.fitted, effort.last)
@@ -62,7 +64,7 @@ def search(
         if not new:
             break
         beam = sorted(new.values(), key=lambda e: e.error)[: effort.beam[min(level, len(effort.beam) - 1)]]
-        if judge.credible(best.errors, beam[0].errors, rng, setup.parts):
+        if judge.credible(best.errors, beam[0].errors, rng, setup.parts, one_window=setup.one_window(beam[0].errors)):
             best = beam[0]
         elif level or best.error <= effort.enough:
             break

@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+import pytest
 
 from mpc_sgft.diagnose import judge
+from mpc_sgft.diagnose.entry import entry
 from mpc_sgft.diagnose.fit import by_parts, fit, left_out_errors
 from mpc_sgft.diagnose.library import Term
 from mpc_sgft.diagnose.plant import Change
-from mpc_sgft.diagnose.prepare import cut
+from mpc_sgft.diagnose.prepare import Setup, cut
 
 SLOPE = Term(
     effect="slope",
@@ -38,7 +40,7 @@ class Line:
         self.y[-1] += 50.0 + 20.0 * self.x[-1]
 
     def residuals(self, terms: Sequence[Term], points: Sequence[Sequence[np.ndarray]], pick: np.ndarray) -> np.ndarray:
-        return np.stack([p[0][0] * self.x[pick] - self.y[pick] for p in points])
+        return np.stack([(p[0][0] if p else 0.0) * self.x[pick] - self.y[pick] for p in points])
 
 
 def test_a_wild_window_does_not_pull_the_fit() -> None:
@@ -58,23 +60,27 @@ def test_a_gain_in_a_few_windows_is_credible_and_one_in_a_single_window_is_not()
     assert not judge.credible(before, before - 0.01, rng)  # real, and too small for a name
 
 
-def test_a_gain_in_one_of_many_windows_is_not_credible_but_in_several_parts_of_one_of_few_it_is() -> None:
+def test_a_gain_in_all_parts_of_one_window_is_credible_only_where_one_will_do() -> None:
     rng = np.random.default_rng(0)
-    before, one, two, part = np.zeros(48), np.zeros(48), np.zeros(48), np.zeros(24)
-    one[:6], two[3:9] = -2.0, -2.0  # windows of six parts
+    before, one, two, part = np.zeros(24), np.zeros(24), np.zeros(24), np.zeros(24)
+    one[:6], two[3:9], part[0] = -1.0, -1.0, -12.0  # windows of six parts
     assert judge.credible(before, two, rng, parts=6) and not judge.credible(before, one, rng, parts=6)
-    assert judge.credible(before[:24], one[:24], rng, parts=6)
-    part[0] = -12.0
-    assert not judge.credible(before[:24], part, rng, parts=6)
+    assert judge.credible(before, one, rng, parts=6, one_window=True)
+    assert not judge.credible(before, part, rng, parts=6, one_window=True)
 
 
-def test_where_windows_are_few_the_rest_of_one_foretells_a_part_that_is_left_out() -> None:
-    line, pick = Line(), np.arange(4)
-    line.x[:3] = 0.0  # the last window alone shows the slope
-    line.y[:3] = np.random.default_rng(1).normal(size=(3, 40))
-    f = fit(line, [SLOPE], [SLOPE.starts[0]], pick)
-    whole, parts = (left_out_errors(f, cut(4, 4, windows)) for windows in (20, 4))
-    assert whole[12:].max() > 20 > 3 > parts.max()
+@pytest.mark.parametrize(("odd", "trusted"), [(0.0, True), (9.0, False)])
+def test_one_of_few_windows_shows_an_effect_if_it_foretells_its_parts_but_for_noise(odd: float, trusted: bool) -> None:
+    line, fitted, none = Line(), np.arange(3), np.zeros(1)
+    line.x[[0, 1, 3]] = 0.0  # the third alone shows the slope
+    line.y[[0, 1, 3]] = np.random.default_rng(1).normal(size=(3, 40))
+    line.y[2] += odd * np.sin(np.arange(40))
+    f = fit(line, [SLOPE], [SLOPE.starts[0]], fitted)
+    base = fit(line, [], [], fitted)
+    setup = Setup(line, fitted, np.array([3]), cut(3, 8), base, none, none, np.log1p, parts=8)
+    judged = entry(setup, f)
+    assert setup.one_window(judged.errors) == trusted
+    assert (judged.errors[16:24].max() < 1.5) == trusted
 
 
 def test_parts_by_hand() -> None:
