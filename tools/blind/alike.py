@@ -17,6 +17,7 @@ from tools.blind.plants import Array, Plant
 
 ALIKE = (
     {"actuator_gain", "sensor_gain", "payload", "armature"},
+    {"actuator_gain", "deadband"},
     {"actuator_offset", "sensor_offset", "gravity_tilt"},
     {"actuator_delay", "actuator_lag", "sensor_delay"},
     {"viscous_friction", "asymmetric_friction", "quadratic_drag", "load_dependent_friction"},
