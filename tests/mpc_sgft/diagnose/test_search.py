@@ -6,7 +6,10 @@ from collections.abc import Sequence
 
 import mujoco
 import numpy as np
+import pytest
 
+from mpc_sgft.diagnose import screen as screening
+from mpc_sgft.diagnose import search as searching
 from mpc_sgft.diagnose.entry import entry
 from mpc_sgft.diagnose.fit import fit
 from mpc_sgft.diagnose.library import Term, as_gap, candidates, settings
@@ -17,6 +20,7 @@ from mpc_sgft.diagnose.screen import Effort
 from mpc_sgft.diagnose.search import search, swaps
 from mpc_sgft.diagnose.table import Scales
 
+Points = Sequence[Sequence[np.ndarray]]
 PENDULUM = """<mujoco><worldbody><body><joint name="hinge" axis="0 1 0"/><geom size="0.05" pos="0 0 -0.4" mass="1"/>
 </body></worldbody><actuator><motor name="motor" joint="hinge"/></actuator></mujoco>"""
 
@@ -105,3 +109,40 @@ def test_gravity_may_turn_about_one_axis_or_both() -> None:
 def test_an_effect_at_two_joints_is_a_list_in_effects_yaml() -> None:
     gap = as_gap([("payload", {"mass": 1.0}), ("armature", {"at": ["a"]}), ("armature", {"at": ["b"]})])
     assert gap == {"payload": {"mass": 1.0}, "armature": [{"at": ["a"]}, {"at": ["b"]}]}
+
+
+def test_a_richer_set_is_fitted_again_from_where_the_simpler_one_ended(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(2)
+    X, Z = rng.normal(size=(2, 24, 40))
+    y = 2 * X + Z + rng.normal(size=X.shape)
+
+    class Dry(Lines):
+        def residuals(self, terms: Sequence[Term], points: Points, pick: np.ndarray) -> np.ndarray:
+            def one(values: Sequence[np.ndarray]) -> np.ndarray:
+                x = np.concatenate([*values, np.zeros(3)])  # torque, or coulomb, excess, velocity
+                return (x[0] * X + x[1] * x[2] * Z - y)[pick]
+
+            return np.stack([one(p) for p in points])
+
+    def dry(name: str, names: tuple[str, ...]) -> Term:
+        one = np.ones(len(names))
+        return Term(
+            name, (), names, ("1",) * len(one), 0 * one, 0 * one, 50 * one, one, (0.5 * one,), lambda x: Change()
+        )
+
+    calls: dict[str, list[tuple[list[str], np.ndarray]]] = {"sharpen": [], "search": []}
+    for name, module in (("sharpen", screening), ("search", searching)):
+
+        def told(problem, terms, start, pick, iterations=12, name=name):  # noqa: ANN001, ANN202
+            calls[name].append(([t.effect for t in terms], np.concatenate([np.zeros(0), *start])))
+            return fit(problem, terms, start, pick, iterations)
+
+        monkeypatch.setattr(module, "fit", told)
+    problem, fitted, none = Dry(), np.arange(18), np.zeros(1)
+    base = fit(problem, [], [], fitted)
+    setup = Setup(problem, fitted, np.arange(18, 24), fitted[:, None] // 3, base, none, none, np.log1p)
+    terms = [dry("coulomb_friction", ("torque",)), dry("stribeck_friction", ("coulomb", "excess", "velocity"))]
+    search(setup, terms, 1, np.random.default_rng(0))
+    rich = {name: [start for names, start in c if names == ["stribeck_friction"]] for name, c in calls.items()}
+    assert len(rich["search"]) == 2
+    assert any(abs(s[0] - 2) < 0.2 and s[1] == 0 and s[2] == 0.5 for s in rich["sharpen"])
