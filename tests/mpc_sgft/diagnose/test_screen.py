@@ -10,13 +10,19 @@ from mpc_sgft.diagnose import screen as screening
 from mpc_sgft.diagnose.entry import entry
 from mpc_sgft.diagnose.fit import Fit, fit
 from mpc_sgft.diagnose.library import Term, candidates, enrich
-from mpc_sgft.diagnose.plant import Plant
+from mpc_sgft.diagnose.plant import Change, Plant
 from mpc_sgft.diagnose.prepare import Setup
 from mpc_sgft.diagnose.screen import proposals, screen
 from mpc_sgft.diagnose.table import Scales
-from tests.mpc_sgft.diagnose.test_search import PENDULUM, term
 
 TRUE = 2e-4  # of the typical size
+HINGE = """<mujoco><worldbody><body><joint name="hinge" axis="0 1 0"/><geom size="0.05" mass="1"/></body></worldbody>
+<actuator><motor joint="hinge"/></actuator></mujoco>"""
+
+
+def term(name: str) -> Term:
+    one = np.ones(1)
+    return Term(name, (), ("a",), ("1",), 0 * one, -50 * one, 50 * one, one, (0.5 * one,), lambda x: Change())
 
 
 class Steep:
@@ -51,7 +57,7 @@ def test_an_effect_far_below_its_typical_size_is_seen(
 
 
 def test_a_richer_effect_starts_where_the_simpler_one_ended_whatever_its_idle_parameters() -> None:
-    plant = Plant(mujoco.MjSpec.from_string(PENDULUM))
+    plant = Plant(mujoco.MjSpec.from_string(HINGE))
     dry, rich = candidates(plant, {"hinge": Scales(force=2.0, speed=1.0)}, ["coulomb_friction", "stribeck_friction"])
     starts = enrich(rich, dry, np.array([0.7]))
     assert rich.names == ("coulomb", "excess", "velocity")
