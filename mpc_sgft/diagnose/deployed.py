@@ -101,7 +101,7 @@ def prepare(deployment: Deployment, window: float | None, held_out: float | Sequ
     length = LENGTH if window is None else max(1, round(window / dt))
     chain = Chain(deployment, length, MOST)
     fitted, held = split(replayer_view(chain), held_out)
-    blocks = cut(len(fitted), 1)
+    blocks = cut(len(fitted))
     floor = np.concatenate(
         [chain.observation_floor, np.full(chain.drive.shape[2], chain.drive_scale), chain.joint_floor]
     )

@@ -65,8 +65,9 @@ def entry(setup: Setup[Any], f: Fit) -> Entry:
     """
     nominal = len(setup.baseline.terms)
     held = window_errors(setup.problem, f, setup.held, setup.parts)
-    each = np.arange(setup.blocks.size).reshape(setup.blocks.shape)
-    by_part, errors = (setup.judged(np.concatenate([left_out_errors(f, b), held])) for b in (each, setup.blocks))
+    blocks = np.repeat(setup.blocks[:, None], setup.parts, axis=1)
+    each = np.arange(blocks.size).reshape(blocks.shape)
+    by_part, errors = (setup.judged(np.concatenate([left_out_errors(f, b), held])) for b in (each, blocks))
     if setup.one_window(by_part):
         errors = by_part
     ends = np.cumsum([len(t.size) for t in f.terms])

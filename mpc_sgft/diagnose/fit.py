@@ -259,11 +259,6 @@ def window_errors(problem: Residuals, f: Fit, pick: Index, parts: int = 1) -> Ar
     return by_parts(problem.residuals(f.terms, [f.values], pick)[0] ** 2, parts)
 
 
-def block_of_each(blocks: Index, points: int) -> Index:
-    """Block of every residual [W, m], from that of every part of each window [W, parts]."""
-    return np.repeat(blocks, np.diff(part_edges(points, blocks.shape[1])), axis=1)
-
-
 def left_out_errors(f: Fit, blocks: Index) -> Array:
     """Error of each part of each fitted window when its block is left out of the fit, to first order, [W parts].
 
@@ -274,7 +269,8 @@ def left_out_errors(f: Fit, blocks: Index) -> Array:
     count, parts = f.J.shape[-1], blocks.shape[1]
     if not count:
         return by_parts(f.r**2, parts)
-    of, root = block_of_each(blocks, f.r.shape[1]), np.sqrt(f.weights)[:, None]
+    of = np.repeat(blocks, np.diff(part_edges(f.r.shape[1], parts)), axis=1)  # block of every residual
+    root = np.sqrt(f.weights)[:, None]
     J, r, out = f.J * root[..., None], f.r * root, np.empty(f.r.shape)
     total = np.einsum("wmp,wmq->pq", J, J, optimize=True)
     ridge = 1e-9 * np.eye(count) * max(float(np.trace(total)) / count, 1e-30)

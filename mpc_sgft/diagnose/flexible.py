@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mpc_sgft.diagnose.entry import Entry
-from mpc_sgft.diagnose.fit import block_of_each, by_parts, change_of
+from mpc_sgft.diagnose.fit import by_parts, change_of
 from mpc_sgft.diagnose.prepare import Setup
 from mpc_sgft.diagnose.record import Array, Index
 from mpc_sgft.diagnose.table import Scales
@@ -64,8 +64,7 @@ def flexible_fit(setup: Setup, best: Entry, scales: dict[str, Scales], rng: np.r
     weight = best.fit.weights[:, None, None]  # as the named effects were fitted
     Xw, rw = X[fitted] * np.sqrt(weight), r0[fitted] * np.sqrt(weight[..., 0])
     free = free * len(fitted) * r0.shape[1]
-    of = block_of_each(setup.blocks, r0.shape[1])
-    choices = [(_left_out(Xw, rw, of, lam * free) / weight[..., 0], lam) for lam in RIDGES]
+    choices = [(_left_out(Xw, rw, setup.blocks, lam * free) / weight[..., 0], lam) for lam in RIDGES]
     squares, lam = min(choices, key=lambda c: float(np.log1p(c[0].mean(1)).mean()))
     w = _solve(Xw, rw, lam * free)
     held = X[len(fitted) :, :, : J_all.shape[-1]] @ w[: J_all.shape[-1]]
@@ -112,12 +111,13 @@ def _solve(X: Array, r: Array, ridge: Array) -> Array:
     return -np.linalg.solve(A, np.einsum("wmp,wm->p", X, r))
 
 
-def _left_out(X: Array, r: Array, of: Index, ridge: Array) -> Array:
-    """Squares of each residual when its block is left out of the ridge regression, [W, m]; `of` is each one's block."""
-    total_A, total_g = np.einsum("wmp,wmq->pq", X, X, optimize=True) + np.diag(ridge), np.einsum("wmp,wm->p", X, r)
-    out = np.empty(r.shape)
-    for b in np.unique(of):
-        mine = of == b
-        w = -np.linalg.solve(total_A - X[mine].T @ X[mine], total_g - X[mine].T @ r[mine])
+def _left_out(X: Array, r: Array, blocks: Index, ridge: Array) -> Array:
+    """Squares of each window when its block is left out of the ridge regression, [W, m]."""
+    A = np.einsum("wmp,wmq->wpq", X, X)
+    g = np.einsum("wmp,wm->wp", X, r)
+    total_A, total_g, out = A.sum(0) + np.diag(ridge), g.sum(0), np.empty(r.shape)
+    for b in np.unique(blocks):
+        mine = blocks == b
+        w = -np.linalg.solve(total_A - A[mine].sum(0), total_g - g[mine].sum(0))
         out[mine] = (r[mine] + X[mine] @ w) ** 2
     return out

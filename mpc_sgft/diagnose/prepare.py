@@ -39,7 +39,7 @@ class Setup(Generic[P]):
     Attributes:
         problem: Residuals of structures.
         fitted, held: Windows to fit to, and windows never fitted.
-        blocks: Contiguous block of each part of each fitted window, [W, parts].
+        blocks: Contiguous block of each fitted window, [W].
         baseline: The nominal model with uncertain quantities refitted.
         noise, floor: Of each signal, of the sensor and of the simulator (its median), [S].
         quiet: An error below which nothing is left to explain.
@@ -108,7 +108,7 @@ def prepare(
     problem = _problem(replayer, noise, floor, nominal, base.values)
     base = fit(problem, nominal, base.values, fitted)
     parts = max(1, -(-UNITS // len(replayer.windows.start)))
-    blocks = cut(len(fitted), parts)
+    blocks = cut(len(fitted))
     least = by_parts(problem.floor_share[np.concatenate([fitted, held])], parts)  # less says nothing of the machine
 
     def judged(errors: Array) -> Array:
@@ -117,10 +117,9 @@ def prepare(
     return Setup(problem, fitted, held, blocks, base, noise, np.median(floor[0], (0, 1)), judged, NOISE + QUIET, parts)
 
 
-def cut(fitted: int, parts: int) -> Index:
-    """Block of each part of each fitted window, [W, parts]: of neighbouring windows."""
-    block = np.minimum(np.arange(fitted) * BLOCKS // fitted, BLOCKS - 1)
-    return np.repeat(block[:, None], parts, axis=1)
+def cut(fitted: int) -> Index:
+    """Block of each fitted window, [W]: of neighbouring windows."""
+    return np.minimum(np.arange(fitted) * BLOCKS // fitted, BLOCKS - 1)
 
 
 def split(replayer: Any, held_out: float | Sequence[str] | None) -> tuple[Index, Index]:

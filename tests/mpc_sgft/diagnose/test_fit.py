@@ -77,7 +77,7 @@ def test_one_of_few_windows_shows_an_effect_if_it_foretells_its_parts_but_for_no
     line.y[2] += odd * np.sin(np.arange(40))
     f = fit(line, [SLOPE], [SLOPE.starts[0]], fitted)
     base = fit(line, [], [], fitted)
-    setup = Setup(line, fitted, np.array([3]), cut(3, 8), base, none, none, np.log1p, parts=8)
+    setup = Setup(line, fitted, np.array([3]), cut(3), base, none, none, np.log1p, parts=8)
     judged = entry(setup, f)
     assert setup.one_window(judged.errors) == trusted
     assert (judged.errors[16:24].max() < 1.5) == trusted

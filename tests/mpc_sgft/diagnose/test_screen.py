@@ -50,7 +50,7 @@ def test_an_effect_far_below_its_typical_size_is_seen(
     monkeypatch.setattr(screening, "SHRINKS", shrinks)
     problem, fitted, none = Steep(), np.arange(18), np.zeros(1)
     base = fit(problem, [], [], fitted)
-    setup = Setup(problem, fitted, np.arange(18, 24), fitted[:, None] // 3, base, none, none, np.log1p)
+    setup = Setup(problem, fitted, np.arange(18, 24), fitted // 3, base, none, none, np.log1p)
     parent = entry(setup, base)
     ranked, _ = screen(setup, parent, proposals(parent, [term("a")], 1, (1.0, 0.1, 0.01)), 6)
     assert (0.5 < float(ranked[0].start[0][0]) / TRUE < 2.0) == found
@@ -67,7 +67,7 @@ def test_a_richer_effect_starts_where_the_simpler_one_ended_whatever_its_idle_pa
 def test_every_effect_of_a_set_counts_however_much_another_shows() -> None:
     problem, fitted, none = Steep(), np.arange(18), np.zeros(1)
     base = fit(problem, [], [], fitted)
-    setup = Setup(problem, fitted, np.arange(18, 24), fitted[:, None] // 3, base, none, none, np.log1p)
+    setup = Setup(problem, fitted, np.arange(18, 24), fitted // 3, base, none, none, np.log1p)
     J = np.stack([1e6 * problem.column[:18], problem.column[18:].repeat(3, 0)], -1)
     both = Fit((term("a"), term("b")), (np.array([TRUE]), np.zeros(1)), base.r, J)
     assert entry(setup, both).complexity == 2

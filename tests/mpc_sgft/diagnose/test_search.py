@@ -54,7 +54,7 @@ def found(pairs: int) -> list[set[str]]:
     problem, fitted = Lines(), np.arange(18)
     base = fit(problem, [], [], fitted)
     none = np.zeros(1)
-    setup = Setup(problem, fitted, np.arange(18, 24), fitted[:, None] // 3, base, none, none, np.log1p, NOISE)
+    setup = Setup(problem, fitted, np.arange(18, 24), fitted // 3, base, none, none, np.log1p, NOISE)
     terms = [term(name) for name in "abcdefghxy"]
     entries = search(setup, terms, 2, np.random.default_rng(0), effort=Effort(beam=(1,), full=(1, 1, 1), pairs=pairs))
     return [set(e.names) for e in entries if e.error < NOISE + 0.1]
@@ -68,9 +68,7 @@ def test_a_delay_is_exchanged_for_a_lag_but_not_where_there_is_one() -> None:
     problem, fitted, none = Lines(), np.arange(18), np.zeros(1)
     terms = [term("actuator_delay"), term("actuator_lag")]
     problem.columns |= {"actuator_delay": problem.columns["x"], "actuator_lag": problem.columns["y"]}
-    setup = Setup(
-        problem, fitted, np.arange(18, 24), fitted[:, None] // 3, fit(problem, [], [], fitted), none, none, np.log1p
-    )
+    setup = Setup(problem, fitted, np.arange(18, 24), fitted // 3, fit(problem, [], [], fitted), none, none, np.log1p)
     alone, both = (entry(setup, fit(problem, t, [none] * len(t), fitted)) for t in (terms[:1], terms))
     assert [e.names for e in swaps(setup, {alone.key: alone}, terms, Effort()).values()] == [["actuator_lag"]]
     assert not swaps(setup, {both.key: both}, terms, Effort())
@@ -82,7 +80,7 @@ def test_where_noise_alone_is_left_an_effect_must_gain_more() -> None:
         problem,
         fitted,
         np.arange(18, 24),
-        fitted[:, None] // 3,
+        fitted // 3,
         fit(problem, [], [], fitted),
         none,
         none,
@@ -140,7 +138,7 @@ def test_a_richer_set_is_fitted_again_from_where_the_simpler_one_ended(monkeypat
         monkeypatch.setattr(module, "fit", told)
     problem, fitted, none = Dry(), np.arange(18), np.zeros(1)
     base = fit(problem, [], [], fitted)
-    setup = Setup(problem, fitted, np.arange(18, 24), fitted[:, None] // 3, base, none, none, np.log1p)
+    setup = Setup(problem, fitted, np.arange(18, 24), fitted // 3, base, none, none, np.log1p)
     terms = [dry("coulomb_friction", ("torque",)), dry("stribeck_friction", ("coulomb", "excess", "velocity"))]
     search(setup, terms, 1, np.random.default_rng(0))
     rich = {name: [start for names, start in c if names == ["stribeck_friction"]] for name, c in calls.items()}
