@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from envs.perception.base import Array, PerceptionError
 from envs.perception.extra import load
 from envs.perception.intrinsics import Intrinsics
-from envs.perception.pipeline import start_camera, start_recording
+from envs.perception.pipeline import start_camera, start_recording, stop
 
 START_S = 5.0  # [s] until the first picture of a camera
 NEXT_MS = 1000  # for the next frame of a recording to be read; then it has ended
@@ -188,4 +188,4 @@ class RealSense:
         """Let go of the camera; a second call does nothing."""
         pipeline, self._pipeline, self._ahead = self._pipeline, None, None
         if pipeline is not None:
-            pipeline.stop()
+            stop(pipeline)

@@ -52,3 +52,15 @@ def start_recording(path: str | Path) -> tuple[Any, Any]:
         return pipeline, pipeline.start(config)
     except RuntimeError as err:
         raise PerceptionError(f"{path} does not start: {err}.") from err
+
+
+def stop(pipeline: Any) -> None:
+    """Stop a running pipeline.
+
+    The thread that reads a recording outlives librealsense's own stop, and crashes when its device is gone. So the
+    device is held until pausing it, which waits for that thread, has returned.
+    """
+    device = pipeline.get_active_profile().get_device()
+    pipeline.stop()
+    if device.is_playback():
+        device.as_playback().pause()
