@@ -39,7 +39,9 @@ class Flexible(NamedTuple):
         return float(self.errors.mean())
 
 
-def flexible_fit(setup: Setup, best: Entry, scales: dict[str, Scales], rng: np.random.Generator) -> Flexible:
+def flexible_fit(
+    setup: Setup, best: Entry, scales: dict[tuple[str, str], Scales], rng: np.random.Generator
+) -> Flexible:
     """Fit features on top of a set of effects, whose parameters move along (to first order)."""
     problem, replayer = setup.problem, setup.problem.replayer
     pick = np.concatenate([setup.fitted, setup.held])
@@ -72,7 +74,7 @@ def flexible_fit(setup: Setup, best: Entry, scales: dict[str, Scales], rng: np.r
     return Flexible(setup.judged(by_parts(squares, setup.parts)), (w / norm)[: J_all.shape[-1]], lam)
 
 
-def _features(setup: Setup, scales: dict[str, Scales], rng: np.random.Generator) -> Array:
+def _features(setup: Setup, scales: dict[tuple[str, str], Scales], rng: np.random.Generator) -> Array:
     """Forces of all features along the recorded motion, in N or N m times PUSH, [F, W, N, nj]."""
     replayer = setup.problem.replayer
     w, joints = replayer.windows, replayer.plant.joints
@@ -85,7 +87,7 @@ def _features(setup: Setup, scales: dict[str, Scales], rng: np.random.Generator)
         q[mine], v[mine], u[mine] = s.q[rows], s.v[rows], replayer.episodes[i].ctrl[rows]
     out = []
     for j, name in enumerate(joints):
-        at = scales[name]
+        at = scales["joint", name]
         force = PUSH * at.force
         x = np.stack([(q[..., j] - at.centre) / at.travel, v[..., j] / at.speed], -1)
         for k in range(FEATURES):

@@ -20,7 +20,7 @@ from mpc_sgft.diagnose.plant import Change, Plant, joint_of
 from mpc_sgft.diagnose.record import Array
 from mpc_sgft.diagnose.signals import SIGNALS
 from mpc_sgft.diagnose.table import INCLUDES, TABLE, Scales
-from mpc_sgft.errors import unknown
+from mpc_sgft.errors import UserError, unknown
 
 HIDDEN = ("velocity", "rest")  # parameters that mean nothing while the effect is neutral
 LONG = (int(mujoco.mjtGeom.mjGEOM_CAPSULE), int(mujoco.mjtGeom.mjGEOM_CYLINDER))
@@ -57,12 +57,12 @@ class Term:
         return f"{self.effect}@{','.join(self.at)}" if self.at else self.effect
 
 
-def candidates(plant: Plant, scales: Mapping[str, Scales], effects: Sequence[str] | None) -> list[Term]:
+def candidates(plant: Plant, scales: Mapping[tuple[str, str], Scales], effects: Sequence[str] | None) -> list[Term]:
     """Every effect that the data may show, at every place it may sit.
 
     Args:
         plant: The nominal scene.
-        scales: Joint, actuator or body -> typical sizes there.
+        scales: (kind, name) of a joint, actuator, signal, body or touching geom -> typical sizes there.
         effects: Restrict to these; None for the whole table.
 
     Raises:
@@ -77,14 +77,20 @@ def candidates(plant: Plant, scales: Mapping[str, Scales], effects: Sequence[str
         "actuator": plant.actuators,
         "body": plant.bodies,
         "signal": [f"qpos/{j}" for j in plant.joints],
+        "geom": [name for kind, name in scales if kind == "geom"],
         "": [""],
     }
     driven = [j for a in plant.actuators if (j := joint_of(plant, a))]
-    built = []
+    built: list[Term] = []
     for name in (n for n in possible if effects is None or n in effects):
-        for place in driven if TABLE[name].driven else places[kind_of(name).place]:
+        kind = kind_of(name).place
+        for place in driven if TABLE[name].driven else places[kind]:
             variants = load_positions(plant, place) if name == "payload" else TABLE[name].variants
-            built += [make_term(plant, name, place, scales.get(place, Scales()), fixed) for fixed in variants]
+            built += [make_term(plant, name, place, scales.get((kind, place), Scales()), fixed) for fixed in variants]
+    for name in effects or []:
+        if not any(t.effect == name for t in built):
+            what = "geoms that touch while the machine moves" if kind_of(name).place == "geom" else "a driven joint"
+            raise UserError(f"--effects {name}: it needs {what}, and here there are none; leave it out.")
     return built
 
 

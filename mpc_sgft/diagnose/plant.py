@@ -182,7 +182,8 @@ def _decompile(model: mujoco.MjModel) -> mujoco.MjSpec:
 
 def _name_all(spec: mujoco.MjSpec) -> None:
     """Effects sit at names: give one to what has none."""
-    for kind, elements in (("joint", spec.joints), ("actuator", spec.actuators), ("body", spec.bodies)):
+    named = {"joint": spec.joints, "actuator": spec.actuators, "body": spec.bodies, "geom": spec.geoms}
+    for kind, elements in named.items():
         for i, element in enumerate(elements):
             if not element.name:
                 element.name = f"{kind}{i}"

@@ -196,8 +196,9 @@ def _problem(replayer: Replayer, noise: Array, floor: Array, terms: Sequence[Ter
     return Problem(replayer, noise, floor, sd, sensitivity)
 
 
-def scales(plant: Plant, replayer: Replayer) -> dict[str, Scales]:
-    """Typical sizes at every joint, actuator and body, from the measured motion."""
+def scales(plant: Plant, replayer: Replayer) -> dict[tuple[str, str], Scales]:
+    """Typical sizes by (kind, name), from the measured motion: of every joint, actuator, signal and body, and of geoms
+    that touch others along it."""
     m = plant.model
     data = mujoco.MjData(m)
     q = np.concatenate([s.q for s in replayer.smooth])
@@ -205,7 +206,7 @@ def scales(plant: Plant, replayer: Replayer) -> dict[str, Scales]:
     a = np.concatenate([s.a for s in replayer.smooth])
     u = np.concatenate([e.ctrl for e in replayer.episodes])
     pick = np.linspace(0, len(q) - 1, min(200, len(q))).astype(int)
-    forces, inertias, peak = [], [], np.zeros(m.nu)
+    forces, inertias, peak, touching = [], [], np.zeros(m.nu), {}
     for k in pick:
         data.qpos[:], data.qvel[:], data.ctrl[:] = q[k], v[k], u[k]
         mujoco.mj_forward(m, data)
@@ -214,6 +215,9 @@ def scales(plant: Plant, replayer: Replayer) -> dict[str, Scales]:
         inertias.append(np.diag(full))
         forces.append(np.abs(full @ a[k]) + np.abs(data.qfrc_bias) + np.abs(data.qfrc_actuator))
         peak = np.maximum(peak, np.abs(data.actuator_force))
+        for contact in data.contact:
+            moves = [g for g in contact.geom if m.body_weldid[m.geom_bodyid[g]]]
+            touching[m.geom(moves[0]).name] = float(contact.friction[0])
     force = np.sqrt(np.mean(np.square(forces), 0)) + 1e-9
     inertia = np.mean(inertias, 0)
     speed, travel = np.sqrt(np.mean(v**2, 0)) + 1e-6, np.std(q, 0) + 1e-6
@@ -221,12 +225,14 @@ def scales(plant: Plant, replayer: Replayer) -> dict[str, Scales]:
     for i, joint in enumerate(plant.joints):
         middle = float(np.median(q[:, i]))
         at = Scales(float(force[i]), float(speed[i]), float(travel[i]), middle, float(inertia[i]), dt=dt)
-        out[joint] = out[f"qpos/{joint}"] = at
+        out["joint", joint] = out["signal", f"qpos/{joint}"] = at
     for i, name in enumerate(plant.actuators):
         joint = joint_of(plant, name)
-        at = out[joint] if joint else Scales(dt=dt)
+        at = out["joint", joint] if joint else Scales(dt=dt)
         command = float(np.sqrt(np.mean(u[:, i] ** 2))) + 1e-9
-        out[name] = at._replace(command=command, peak=float(peak[i]) + 1e-9)
+        out["actuator", name] = at._replace(command=command, peak=float(peak[i]) + 1e-9)
     for name in plant.bodies:
-        out[name] = Scales(mass=float(m.body_mass[m.body(name).id]), dt=dt)
+        out["body", name] = Scales(mass=float(m.body_mass[m.body(name).id]), dt=dt)
+    for name, friction in touching.items():
+        out["geom", name] = Scales(friction=friction, dt=dt)
     return out

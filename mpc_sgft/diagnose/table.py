@@ -17,6 +17,7 @@ class Scales(NamedTuple):
     command: float = 1.0  # of the actuator
     peak: float = 1.0  # largest force of the actuator, N or N m
     mass: float = 1.0  # kg of the body
+    friction: float = 1.0  # sliding friction of the geom's contacts
     dt: float = 0.001  # s between samples
 
 
@@ -64,6 +65,10 @@ TABLE: dict[str, Row] = {
     "backlash": Row({"gap": Par(0.0, lambda s: 0.1 * s.travel, (0.003, 0.03, 0.3), 0.0, 10.0)}, driven=True),
     "gravity_tilt": Row({"angle": _tilt, "roll": _tilt}, variants=({"roll": 0.0}, {"angle": 0.0}, {})),
     "payload": Row({"mass": Par(0.0, lambda s: s.mass, (0.2,))}),
+    "contact_friction": Row(
+        {"coefficient": Par(lambda s: s.friction, lambda s: 0.5 * s.friction, (-0.5, 0.5, 2.0), -2.0, 10.0)}
+    ),
+    "contact_softness": Row({"time_constant": Par(0.0, lambda s: 0.02, (0.25, 1.0), 0.0, 45.0)}),
     "actuator_gain": Row({"gain": Par(1.0, lambda s: 1.0, (-0.1, 0.1), -0.95, 2.0)}),
     "actuator_offset": Row({"offset": Par(0.0, lambda s: s.command, (0.05, -0.05))}),
     "deadband": Row({"width": Par(0.0, lambda s: s.command, (0.05, 0.3), 0.0, 3.0)}),
@@ -121,6 +126,10 @@ EQUIVALENT = [
         frozenset({"actuator_gain", "payload", "armature", "sensor_gain"}),
         "where inertia is all that resists, force over inertia is all that shows; a measured force or a known load "
         "separates them",
+    ),
+    Equivalence(
+        frozenset({"contact_friction", "coulomb_friction"}),
+        "what is pressed against a surface by a constant force rubs like a dry joint; press harder, or lift it off",
     ),
     Equivalence(
         frozenset({"actuator_delay", "sensor_delay"}),

@@ -40,7 +40,7 @@ def test_asymmetric_viscous_and_coulomb_friction_predict_both_held_out_recording
     plant = Plant(mujoco.MjSpec.from_string(EMPS))
     nominal = nominal_terms(plant, {"mass": 0.3})
     setup = prepare(plant, thirds(data_dir), nominal, window=0.5, signals=None, held_out=["second", "pulses"])
-    at = scales(plant, setup.problem.replayer)["x"]
+    at = scales(plant, setup.problem.replayer)["joint", "x"]
     terms = [*nominal, *(make_term(plant, n, "x", at) for n in ("asymmetric_friction", "coulomb_friction"))]
     f = fit(setup.problem, terms, [*setup.baseline.values, *(t.starts[0] for t in terms[1:])], setup.fitted)
     replayer = setup.problem.replayer

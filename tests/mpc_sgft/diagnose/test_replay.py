@@ -8,10 +8,12 @@ import pytest
 
 from mpc_sgft.diagnose.library import candidates, enrich, make_term
 from mpc_sgft.diagnose.plant import Change, Plant
+from mpc_sgft.diagnose.prepare import scales
 from mpc_sgft.diagnose.record import Episode
 from mpc_sgft.diagnose.replay import Replayer, held_mean
 from mpc_sgft.diagnose.smooth import smooth
 from mpc_sgft.diagnose.table import TABLE, Scales
+from mpc_sgft.errors import UserError
 
 SLIDE = """<mujoco><option timestep="0.002"/><worldbody><body name="cart"><joint name="x" type="slide" axis="1 0 0"/>
 <geom size="0.1" mass="2"/></body></worldbody><actuator><motor name="motor" joint="x"/></actuator></mujoco>"""
@@ -35,7 +37,7 @@ def test_a_right_model_predicts_to_the_second_order(plant) -> None:
     assert np.abs(error).max() < 3e-6  # the first order alone would be h a t / 2 = 5e-4 m
 
 
-def testheld_mean_by_hand() -> None:
+def test_held_mean_by_hand() -> None:
     u = np.array([1.0, 3.0])  # held on [0, 1) and [1, 2)
     edges = np.array([[0.0, 1.0], [0.5, 1.5], [1.5, 3.0], [-1.0, 0.5]])
     np.testing.assert_allclose(held_mean(u, 1.0, edges), [1.0, 2.0, 3.0, 1.0])
@@ -122,23 +124,43 @@ def test_in_sharper_steps_dry_friction_turns_at_once() -> None:
 
 def test_effects_in_one_batch_do_not_disturb_each_other(plant) -> None:
     replayer = Replayer(plant, [_sine()], 0.5, ["qpos/x"])
-    terms = candidates(plant, {"x": Scales(), "motor": Scales(), "cart": Scales(), "qpos/x": Scales()}, None)
+    terms = candidates(plant, {("geom", "geom0"): Scales()}, None)
     changes = [t.build(t.starts[0]) for t in terms]
     together = replayer.simulate([*changes, Change()])
     for change, values in zip(changes, together[:-1], strict=True):
         np.testing.assert_array_equal(replayer.simulate([change])[0], values)
 
 
+def test_an_effect_that_has_no_place_here_is_refused(plant) -> None:
+    with pytest.raises(UserError, match="contact_friction: it needs geoms that touch"):
+        candidates(plant, {}, ["viscous_friction", "contact_friction"])
+
+
 def test_every_effect_of_the_table_is_known_and_neutral_at_its_neutral_value(plant) -> None:
     replayer = Replayer(plant, [_sine()], 0.5, ["qpos/x"])
     nominal = replayer.simulate([Change()])[0]
     for name in TABLE:
-        place = {"joint": "x", "actuator": "motor", "body": "cart", "signal": "qpos/x"}.get(
+        place = {"joint": "x", "actuator": "motor", "body": "cart", "signal": "qpos/x", "geom": "geom0"}.get(
             __import__(f"envs.effects.{name}", fromlist=["EFFECT"]).EFFECT.place, ""
         )
         term = make_term(plant, name, place, Scales(peak=5.0))
         same = replayer.simulate([term.build(np.clip(term.neutral, term.low, term.high))])[0]
         np.testing.assert_allclose(same, nominal, atol=1e-6, err_msg=name)
+
+
+SHARED = """<mujoco><worldbody><geom name="wall" type="plane" size="2 2 1" friction="0.3"/>
+<geom name="far" type="box" size="1 1 1" pos="9 9 9"/><body name="x"><joint name="x" type="slide" axis="1 0 0"/>
+<geom name="x" size="0.1" mass="2" friction="0.4"/></body></worldbody>
+<actuator><motor name="x" joint="x"/></actuator></mujoco>"""
+
+
+def test_what_shares_a_name_keeps_its_own_size_and_what_touches_is_found() -> None:
+    plant = Plant(mujoco.MjSpec.from_string(SHARED))
+    at = scales(plant, Replayer(plant, [_sine()], 0.5, ["qpos/x"]))
+    rms = float(np.sqrt(np.mean(_sine().ctrl ** 2)))
+    assert abs(at["joint", "x"].force - 2 * rms) < 0.05 * rms  # the motor's and inertia's
+    assert abs(at["actuator", "x"].command - rms) < 1e-6 and at["body", "x"].mass == 2.0
+    assert {name: s.friction for (kind, name), s in at.items() if kind == "geom"} == {"x": 0.4}
 
 
 def test_a_richer_effect_starts_as_the_simpler_one(plant) -> None:

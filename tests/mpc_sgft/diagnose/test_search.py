@@ -99,7 +99,7 @@ def test_where_noise_alone_is_left_an_effect_must_gain_more() -> None:
 
 def test_gravity_may_turn_about_one_axis_or_both() -> None:
     plant = Plant(mujoco.MjSpec.from_string(PENDULUM))
-    tilts = candidates(plant, {"": Scales()}, ["gravity_tilt"])
+    tilts = candidates(plant, {("", ""): Scales()}, ["gravity_tilt"])
     assert [t.names for t in tilts] == [("angle",), ("roll",), ("angle", "roll")]
     assert settings(tilts[0], np.array([0.1])) == {"angle": 0.1, "roll": 0.0}
 

@@ -6,11 +6,17 @@ import json
 from pathlib import Path
 
 import mujoco
+import numpy as np
 import yaml
 
 from envs.effects import load
 from mpc_sgft.diagnose import diagnose
+from mpc_sgft.diagnose.record import write_csv
 
+SANDER = """<mujoco><option timestep="0.002"/><worldbody><geom name="table" type="plane" size="2 2 0.1" friction="0.6"/>
+<body name="block" pos="0 0 0.05"><joint name="x" type="slide" axis="1 0 0"/><joint name="z" type="slide" axis="0 0 1"/>
+<geom name="foot" type="box" size="0.05 0.05 0.05" mass="2" friction="0.6"/></body></worldbody>
+<actuator><motor name="pull" joint="x" gear="10"/><motor name="press" joint="z" gear="10"/></actuator></mujoco>"""
 FEW = ["viscous_friction", "coulomb_friction", "quadratic_drag", "actuator_delay", "actuator_offset"]
 
 
@@ -41,3 +47,31 @@ def test_a_wrong_mass_is_refitted_and_not_called_an_effect(slide, record) -> Non
     report = diagnose(slide, [record(mass=5.8)], effects=FEW, uncertain={"mass": 0.3}).as_dict()
     assert report["verdict"] == "none", report["reason"]
     assert abs(report["nominal_refit"]["mass cart"]["factor"] - 5.8 / 5.0) < 0.005
+
+
+def test_a_surface_that_is_slipperier_is_told_from_a_dry_joint_by_pressing(tmp_path: Path) -> None:
+    model = mujoco.MjModel.from_xml_string(SANDER)
+    model.opt.timestep, model.geom_friction[:, 0] = 2e-4, 0.3
+    data, dt, rng = mujoco.MjData(model), 0.004, np.random.default_rng(0)
+    t = np.arange(1000) * dt
+    pull = sum(2.4 / k * np.cos(2 * np.pi * k * 0.6 * t + k) for k in (1, 2, 3))
+    ctrl, read = np.stack([pull, -1 - np.sin(2 * np.pi * 0.37 * t)], 1), []
+    mujoco.mj_step(model, data, 2000)  # until it has settled
+    for command in ctrl:
+        read.append(data.qpos + 2e-5 * rng.standard_normal(2))
+        data.ctrl[:] = command
+        mujoco.mj_step(model, data, round(dt / model.opt.timestep))
+    columns = {
+        "time": t,
+        "ctrl/pull": ctrl[:, 0],
+        "ctrl/press": ctrl[:, 1],
+        "qpos/x": np.array(read)[:, 0],
+        "qpos/z": np.array(read)[:, 1],
+    }
+    (tmp_path / "sander.xml").write_text(SANDER)
+    write_csv(tmp_path / "sander.csv", columns)
+    few = ["contact_friction", "coulomb_friction"]
+    report = diagnose(tmp_path / "sander.xml", [tmp_path / "sander.csv"], effects=few).as_dict()
+    assert [e["name"] for e in report["effects"]] == ["contact_friction"] and report["effects"][0]["at"] == ["foot"]
+    assert abs(report["effects"][0]["parameters"]["coefficient"]["value"] - 0.3) < 0.003
+    assert report["held_out"]["low"] > 0.9
