@@ -95,6 +95,7 @@ class Problem:
         replayer: Simulates.
         sigma: Noise of each signal, one sample, [S].
         floor: Error of the simulator itself, with its sign, terms [F, W, n, S] that add up in squares.
+        doubt: Of each sample, beyond its noise, [W, n, S]; as large for its neighbours.
         start_sd: Uncertainty of each window's start, [W, 2 nj]; projected out.
         sensitivity: Derivative of the predictions by the start, [W, n, S, 2 nj].
 
@@ -104,15 +105,18 @@ class Problem:
 
     step, pattern = STEP, ()
 
-    def __init__(self, replayer: Replayer, sigma: Array, floor: Array, start_sd: Array, sensitivity: Array):
+    def __init__(
+        self, replayer: Replayer, sigma: Array, floor: Array, doubt: Array, start_sd: Array, sensitivity: Array
+    ):
         self.replayer, self.sigma = replayer, sigma
         n = replayer.windows.samples
         self.stride = max(1, n // MAX_POINTS)
         self.blocks = n // self.stride
         self.target = self._average(replayer.windows.measured)
         noise = sigma / np.sqrt(self.stride)
-        self.scale = np.sqrt(noise**2 + np.minimum((self._average(floor) ** 2).sum(0), (MOST_FLOOR * noise) ** 2))
-        self.floor_share = (1 - (noise / self.scale) ** 2).reshape(len(self.scale), -1)
+        own = np.minimum((self._average(floor) ** 2).sum(0), (MOST_FLOOR * noise) ** 2)
+        self.scale = np.sqrt(noise**2 + own + self._average(doubt) ** 2)
+        self.floor_share = (own / self.scale**2).reshape(len(self.scale), -1)
         moved = self._average(np.moveaxis(sensitivity, -1, 0)) / self.scale  # [2 nj, W, nb, S]
         a = moved.reshape(*moved.shape[:2], -1).transpose(1, 2, 0) * start_sd[:, None]  # [W, m, 2 nj]
         self.u, s, _ = np.linalg.svd(a, full_matrices=False)

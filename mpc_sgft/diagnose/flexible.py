@@ -56,11 +56,10 @@ def flexible_fit(
         -1,
     )  # [W, m, F]
     fitted = np.arange(len(setup.fitted))
-    J = best.fit.J
-    J_all = response if not J.shape[-1] else response
-    own = np.concatenate([J, np.zeros((len(setup.held), *J.shape[1:]))]) if J.shape[-1] else np.zeros((*r0.shape, 0))
-    X = np.concatenate([J_all, own], -1)
-    free = np.r_[np.ones(J_all.shape[-1]), np.full(own.shape[-1], 1e-6)]
+    J, count = best.fit.J, response.shape[-1]
+    own = np.concatenate([J, np.zeros((len(setup.held), *J.shape[1:]))])
+    X = np.concatenate([response, own], -1)
+    free = np.r_[np.ones(count), np.full(own.shape[-1], 1e-6)]
     norm = np.sqrt((X[fitted] ** 2).mean((0, 1))) + 1e-12
     X = X / norm
     weight = best.fit.weights[:, None, None]  # as the named effects were fitted
@@ -69,9 +68,9 @@ def flexible_fit(
     choices = [(_left_out(Xw, rw, setup.blocks, lam * free) / weight[..., 0], lam) for lam in RIDGES]
     squares, lam = min(choices, key=lambda c: float(np.log1p(c[0].mean(1)).mean()))
     w = _solve(Xw, rw, lam * free)
-    held = X[len(fitted) :, :, : J_all.shape[-1]] @ w[: J_all.shape[-1]]
+    held = X[len(fitted) :, :, :count] @ w[:count]
     squares = np.concatenate([squares, (r0[len(fitted) :] + held) ** 2])
-    return Flexible(setup.judged(by_parts(squares, setup.parts)), (w / norm)[: J_all.shape[-1]], lam)
+    return Flexible(setup.judged(by_parts(squares, setup.parts)), (w / norm)[:count], lam)
 
 
 def _features(setup: Setup, scales: dict[tuple[str, str], Scales], rng: np.random.Generator) -> Array:

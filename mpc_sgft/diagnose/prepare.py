@@ -100,12 +100,13 @@ def prepare(
         raise UserError(f"only {len(replayer.windows.start)} windows: give more data or a shorter --window.")
     fitted, held = split(replayer, held_out)
     noise = np.array([np.median([noise_of(e.signals[s]) for e in episodes]) for s in chosen])
-    first = _problem(replayer, noise, np.zeros((0, *replayer.windows.measured.shape)), [], [])
+    shape = replayer.windows.measured.shape
+    first = _problem(replayer, noise, np.zeros((0, *shape)), np.zeros(shape), [], [])
     base = fit(first, nominal, [t.neutral for t in nominal], fitted)
     missed = replayer.windows.measured - replayer.simulate([change_of(nominal, base.values)])[0]
     noise = np.minimum(noise, [np.median([noise_of(x) for x in missed[..., i]]) for i in range(len(chosen))])
-    floor = simulator_floor(plant, episodes, replayer, nominal, base.values)
-    problem = _problem(replayer, noise, floor, nominal, base.values)
+    floor, doubt = simulator_floor(plant, episodes, replayer, nominal, base.values)
+    problem = _problem(replayer, noise, floor, doubt, nominal, base.values)
     base = fit(problem, nominal, base.values, fitted)
     parts = max(1, -(-UNITS // len(replayer.windows.start)))
     blocks = cut(len(fitted))
@@ -157,8 +158,9 @@ def split(replayer: Any, held_out: float | Sequence[str] | None) -> tuple[Index,
 
 def simulator_floor(
     plant: Plant, episodes: Sequence[Episode], replayer: Replayer, terms: Sequence[Term], values: Sequence[Array]
-) -> Array:
-    """How far a prediction may be off although the model is right, at every sample of every window, [2, W, n, S].
+) -> tuple[Array, Array]:
+    """How far a prediction may be off although the model is right, at every sample of every window: the simulator's own
+    error, [2, W, n, S], and the doubt about readings of scattered stamps, [W, n, S].
 
     By the simulator's time step: half of it changes the prediction by three quarters of a second-order error, or half
     of a first-order one, which dry friction makes where a motion reverses; what is off once in a window is taken to
@@ -172,16 +174,19 @@ def simulator_floor(
     change = change_of(terms, values)
     predicted = replayer.simulate([change])[0]
     step = np.maximum.accumulate(np.abs(finer.simulate([change])[0] - predicted), 1) * 2
-    clock = np.zeros_like(step)
-    loose = np.array([episodes[i].scattered for i in w.episode])
-    for i in (i for i, name in enumerate(replayer.signals) if name.startswith("force/")):
-        clock[..., i] = np.gradient(predicted[..., i], axis=1)
-        jumps = np.abs(np.diff(predicted[loose, :, i], axis=1))
-        clock[loose, :, i] = np.pad(jumps, ((0, 0), (1, 0))) + np.pad(jumps, ((0, 0), (0, 1)))
-    return np.stack([step, clock])
+    clock = predicted - replayer.read_early().simulate([change])[0]
+    loose = np.array([episodes[i].scattered for i in w.episode])[:, None, None]
+    return np.stack([step, np.where(loose, 0.0, clock)]), np.where(loose, np.abs(clock) / 2, 0.0)
 
 
-def _problem(replayer: Replayer, noise: Array, floor: Array, terms: Sequence[Term], values: Sequence[Array]) -> Problem:
+def _problem(
+    replayer: Replayer,
+    noise: Array,
+    floor: Array,
+    doubt: Array,
+    terms: Sequence[Term],
+    values: Sequence[Array],
+) -> Problem:
     w = replayer.windows
     starts = [(replayer.smooth[i], k) for i, k in zip(w.episode, w.start, strict=True)]
     sd = np.array([np.concatenate([s.q_sd, s.v_sd[k]]) for s, k in starts])
@@ -193,7 +198,7 @@ def _problem(replayer: Replayer, noise: Array, floor: Array, terms: Sequence[Ter
     y = replayer.simulate([change] * len(shifts), shift=shifts)
     half = len(kick)
     sensitivity = np.moveaxis((y[:half] - y[half:]) / (2 * kick[:, None, None, None]), 0, -1)
-    return Problem(replayer, noise, floor, sd, sensitivity)
+    return Problem(replayer, noise, floor, doubt, sd, sensitivity)
 
 
 def scales(plant: Plant, replayer: Replayer) -> dict[tuple[str, str], Scales]:

@@ -72,6 +72,7 @@ class Replayer:
         self.windows = self._cut(max(2, round(window / self.dt)))
         self._nominal_ctrl: Array | None = None
         self.simulations = 0
+        self.early = False
 
     def simulate(
         self,
@@ -110,10 +111,16 @@ class Replayer:
         other._nominal_ctrl = None
         return other
 
+    def read_early(self) -> Replayer:
+        """The same windows with forces that are read just before a sample's command, not just after."""
+        other = copy.copy(self)
+        other.early = True
+        return other
+
     @property
     def steps(self) -> int:
-        """Physics steps in a window."""
-        return int(np.ceil(self.windows.samples * self.dt / self.h - 1e-6)) + 2
+        """Physics steps in a window, and those that a force at its last sample is read from."""
+        return int(np.ceil(self.windows.samples * self.dt / self.h - 1e-6)) + 3
 
     def step_times(self) -> Array:
         """Time of each physics step of each window since its episode's start [s], [W, N]."""
@@ -211,15 +218,25 @@ class Replayer:
             elif kind == "qvel":
                 i = self.plant.joints.index(part)
                 columns.append(_at(qvel[..., i], (times + self.half - late[:, i, None]) / self.h))
-            elif kind == "force":  # of the command from this sample on, and from the actuator's to its joint's
+            elif kind == "force":
                 felt = m.actuator(part).gear[0] * sensed[..., int(m.sensor(f"{FORCE}{part}").adr[0])]
-                after = _at(felt, times / self.h + (1.0 if self.half else 0.0))
-                if self.half and self.dt > 3 * self.h:  # back to the sample's own state, under its new command
-                    after = 2 * after - _at(felt, times / self.h + 2.0)
-                columns.append(after)
+                columns.append(self._force(felt, times / self.h))
             else:
                 columns.append(_at(sensed[..., int(m.sensor(part).adr[0])], times / self.h))
         return np.stack(columns, -1)
+
+    def _force(self, felt: Array, at: NDArray[Any]) -> Array:
+        """Force of an actuator on its joint at the samples, of the command from there on, or until there if `early`.
+
+        Args:
+            felt: At each physics step, [K, W, N].
+            at: Steps of the samples, [1, n].
+        """
+        away = -1.0 if self.early else 1.0 if self.half else 0.0
+        value = _at(felt, at + away)
+        if away and self.dt > 3 * self.h:  # back to the sample's own state, under that command
+            value = 2 * value - _at(felt, at + 2 * away)
+        return value
 
     def _ctrl(self, change: Change) -> Array:
         """Mean command of each physics step of each window, [W, N, nu]."""

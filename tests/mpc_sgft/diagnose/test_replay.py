@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import mujoco
 import numpy as np
 import pytest
 
 from mpc_sgft.diagnose.library import candidates, enrich, make_term
 from mpc_sgft.diagnose.plant import Change, Plant
-from mpc_sgft.diagnose.prepare import scales
+from mpc_sgft.diagnose.prepare import prepare, scales, simulator_floor
 from mpc_sgft.diagnose.record import Episode
 from mpc_sgft.diagnose.replay import Replayer, held_mean
 from mpc_sgft.diagnose.smooth import smooth
@@ -73,24 +75,50 @@ def test_a_force_is_what_the_joint_feels() -> None:
     np.testing.assert_allclose(replayer.simulate([Change()])[0], 7 * replayer.windows.measured, atol=1e-12)
 
 
-def test_the_force_of_a_stiff_servo_is_that_of_the_sample_under_its_new_command() -> None:
+@pytest.fixture
+def servo() -> tuple[Plant, Episode, np.ndarray]:
+    """A stiff servo's plant and recording, and the force that each sample would show a moment earlier, [T]."""
     kp, kv, mass, dt, fine = 4000.0, 200.0, 2.0, 0.004, 2e-5
-    servo = f'<position name="servo" joint="x" kp="{kp}" kv="{kv}"/>'
-    plant = Plant(mujoco.MjSpec.from_string(SLIDE.replace('<motor name="motor" joint="x"/>', servo)))
-    t, q, v, rows = dt * np.arange(400), 0.0, 0.0, []
+    drive = f'<position name="servo" joint="x" kp="{kp}" kv="{kv}"/>'
+    plant = Plant(mujoco.MjSpec.from_string(SLIDE.replace('<motor name="motor" joint="x"/>', drive)))
+    t, q, v, old, rows = dt * np.arange(400), 0.0, 0.0, 0.0, []
     command = 0.1 * np.sin(6.0 * t)
     for u in command:
-        rows.append((q, kp * (u - q) - kv * v))
+        rows.append((q, kp * (u - q) - kv * v, kp * (old - q) - kv * v))
         for _ in range(round(dt / fine)):
             v += fine * (kp * (u - q) - kv * v) / mass
             q += fine * v
-    q_measured, force = np.array(rows).T
-    signals = {"qpos/x": q_measured, "force/servo": force}
-    replayer = Replayer(plant.sharper(), [Episode("e", dt, command[:, None], signals)], 0.4, ["force/servo"])
-    error = replayer.simulate([Change()])[0] - replayer.windows.measured
-    assert (
-        np.median(np.abs(error)) < 0.02 * np.abs(force).max()
-    )  # what is left comes from the starts; a step late: 0.04
+        old = u
+    q_measured, force, early = np.array(rows).T
+    return plant.sharper(), Episode("e", dt, command[:, None], {"qpos/x": q_measured, "force/servo": force}), early
+
+
+def test_the_force_of_a_stiff_servo_is_that_of_the_sample_under_its_new_command(servo) -> None:
+    plant, episode, early = servo
+    replayer = Replayer(plant, [episode], 0.4, ["force/servo"])
+    w, size = replayer.windows, np.abs(episode.signals["force/servo"]).max()
+    error = replayer.simulate([Change()])[0] - w.measured
+    assert np.median(np.abs(error)) < 0.02 * size  # what is left comes from the starts; a step late: 0.04
+    before = np.array([early[s + 1 : s + 1 + w.samples] for s in w.start])[..., None]
+    error = replayer.read_early().simulate([Change()])[0] - before
+    assert np.median(np.abs(error)) < 0.02 * size < np.median(np.abs(before - w.measured))
+
+
+@pytest.mark.parametrize("scattered", [False, True])
+def test_a_force_may_have_been_read_before_its_command(servo, scattered: bool) -> None:
+    plant, episode, _ = servo
+    episode = replace(episode, scattered=scattered)
+    replayer = Replayer(plant, [episode], 0.4, ["qpos/x", "force/servo"])
+    floor, doubt = simulator_floor(plant, [episode], replayer, [], [])
+    w, jump = replayer.windows, 4000.0 * np.diff(episode.ctrl[:, 0], prepend=0.0)
+    jumps = np.array([jump[s + 1 : s + 1 + w.samples] for s in w.start])
+    often, always = (np.abs(jumps) / 2, 0 * jumps) if scattered else (0 * jumps, jumps)
+    near = 0.05 * np.abs(jumps).max()
+    np.testing.assert_allclose(doubt[..., 1], often, atol=near)
+    np.testing.assert_allclose(floor[1, ..., 1], always, atol=near)
+    assert not doubt[..., 0].any() and not floor[1, ..., 0].any()
+    problem = prepare(plant, [episode], [], window=0.3, signals=None, held_out=None).problem
+    assert (np.median(problem.scale[..., 1]) > 0.3 * np.median(np.abs(jumps))) == scattered
 
 
 @pytest.mark.parametrize("sharp", [False, True])
