@@ -22,6 +22,7 @@ STEP = 1e-2  # finite differences, in typical sizes of a parameter
 TOLERANCE = 1e-3  # relative gain of an iteration that is too small to go on
 ITERATIONS = 12
 MOST_STEPS = 8  # of a pattern search, of one size
+HOPS = (-2.0, -1.0, -0.5, -0.25, 0.25, 0.5, 1.0, 2.0)  # to neighbouring minima, and around in a narrow one
 OUTLYING = 4.0  # times the median error, or noise
 MOST_FLOOR = 10.0  # times the noise: the simulator's own error weighs a point down by no more
 
@@ -152,17 +153,28 @@ def fit(
         iterations: At most.
     """
     flat = _Flat(terms)
-    x, damping, r, J = flat.pack(start), 1e-2, None, None
+    x = flat.pack(start)
     if not flat.count:
         r = problem.residuals(terms, [start], pick)[0]
         return Fit(tuple(terms), tuple(start), r, np.zeros((*r.shape, 0)))
+    x = _descend(problem, flat, x, pick, iterations)
+    if flat.hops.any() and (elsewhere := _hop(problem, flat, x, pick)) is not x:
+        x = _descend(problem, flat, elsewhere, pick, iterations)
+    if problem.pattern:
+        x = _walk(problem, flat, x, pick)
+    r, J = _linearise(problem, flat, x, pick)
+    return Fit(tuple(terms), tuple(flat.unpack(x)), r, J)
+
+
+def _descend(problem: Residuals, flat: _Flat, x: Array, pick: Index, iterations: int) -> Array:
+    damping = 1e-2
     for _ in range(iterations):
         r, J = _linearise(problem, flat, x, pick)
         w = weights(r)
         A, g = np.einsum("w,wmp,wmq->pq", w, J, J, optimize=True), np.einsum("w,wmp,wm->p", w, J, r, optimize=True)
         tries = [flat.clip(x + _step(A, g, lam, x, flat)) for lam in (damping / 10, damping, damping * 30)]
         scale = typical(r)
-        costs = robust(problem.residuals(terms, [flat.unpack(t) for t in tries], pick), scale)
+        costs = robust(problem.residuals(flat.terms, [flat.unpack(t) for t in tries], pick), scale)
         best = int(np.argmin(costs))
         before = float(robust(r, scale))
         damping = min(max(damping * (0.1, 1.0, 30.0)[best], 1e-8), 1e8)
@@ -172,15 +184,27 @@ def fit(
                 break
             continue
         x = tries[best]
-        J = None
         if before - costs[best] < TOLERANCE * before:
             break
-    if problem.pattern:
-        x, J = _walk(problem, flat, x, pick), None
-    if J is None:
-        r, J = _linearise(problem, flat, x, pick)
-    assert r is not None
-    return Fit(tuple(terms), tuple(flat.unpack(x)), r, J)
+    return x
+
+
+def _hop(problem: Residuals, flat: _Flat, x: Array, pick: Index) -> Array:
+    """To the best of the neighbours at a parameter's hops, and of points between them, while that is better.
+
+    A force follows its command at once: whether a late command comes before or after a sample changes what is read
+    there, so that the error has a minimum between any two samples.
+    """
+    around = np.concatenate([k * np.diag(flat.hops)[flat.hops > 0] for k in HOPS])
+    scale = typical(problem.residuals(flat.terms, [flat.unpack(x)], pick)[0])
+    for _ in range(MOST_STEPS):
+        tries = [x, *(flat.clip(x + a) for a in around)]
+        costs = robust(problem.residuals(flat.terms, [flat.unpack(t) for t in tries], pick), scale)
+        best = int(np.argmin(costs))
+        if costs[best] >= (1 - TOLERANCE) * costs[0]:
+            break
+        x = tries[best]
+    return x
 
 
 def _walk(problem: Residuals, flat: _Flat, x: Array, pick: Index) -> Array:
@@ -231,6 +255,7 @@ class _Flat:
         self.low = np.concatenate([none, *(t.low for t in terms)]) / self.size
         self.high = np.concatenate([none, *(t.high for t in terms)]) / self.size
         self.count = len(self.size)
+        self.hops = np.concatenate([none, *(t.hops or np.zeros(len(t.size)) for t in terms)]) / self.size
 
     def pack(self, values: Sequence[Array]) -> Array:
         return self.clip(np.concatenate([np.zeros(0), *values]) / self.size)

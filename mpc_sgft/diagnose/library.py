@@ -38,6 +38,7 @@ class Term:
         starts: Where fits start, each [p].
         build: values [p] -> what they change: a Change, or a tuple of effects where a task's simulation applies them.
         fixed: Parameters that are set and not fitted.
+        hops: Distance between values that fit about as well, [p]; 0 where there is no such thing, empty for none.
     """
 
     effect: str
@@ -51,6 +52,7 @@ class Term:
     starts: tuple[Array, ...]
     build: Callable[[Array], Any]
     fixed: Mapping[str, Any] = field(default_factory=dict)
+    hops: tuple[float, ...] = ()
 
     @property
     def label(self) -> str:
@@ -143,6 +145,7 @@ def make_term(plant: Plant, name: str, place: str, scales: Scales, fixed: Mappin
         starts=tuple(np.clip(neutral + s * sizes, low, high) for s in starts),
         build=partial(_change, plant, name, at, tuple(parameters), fixed or {}),
         fixed=fixed or {},
+        hops=tuple(par.hop(scales) for par in pars),
     )
 
 

@@ -29,6 +29,7 @@ class Par(NamedTuple):
     starts: tuple[float, ...] = (0.1,)
     low: float = -100.0
     high: float = 100.0
+    hop: Callable[[Scales], float] = lambda s: 0.0  # between values that fit about as well: fits try neighbours
 
 
 class Row(NamedTuple):
@@ -75,7 +76,7 @@ TABLE: dict[str, Row] = {
     "torque_saturation": Row({"limit": Par(lambda s: s.peak, lambda s: s.peak, (-0.15, -0.5), -0.97, 0.0)}),
     "sensor_offset": Row({"offset": Par(0.0, lambda s: s.travel, (0.1, -0.1), -3.0, 3.0)}),
     "sensor_gain": Row({"gain": Par(1.0, lambda s: 1.0, (-0.05, 0.05), -0.8, 2.0)}),
-    "actuator_delay": Row({"delay": Par(0.0, lambda s: 0.02, (0.25, 1.0), 0.0, 15.0)}),
+    "actuator_delay": Row({"delay": Par(0.0, lambda s: 0.02, (0.25, 1.0), 0.0, 15.0, lambda s: s.dt)}),
     "sensor_delay": Row({"delay": Par(0.0, lambda s: 0.02, (0.25, 1.0), 0.0, 15.0)}),
     "actuator_lag": Row({"time_constant": Par(0.0, lambda s: 0.02, (0.25, 1.0), 0.0, 15.0)}),
 }

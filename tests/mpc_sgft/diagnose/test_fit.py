@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -50,6 +51,19 @@ def test_a_wild_window_does_not_pull_the_fit() -> None:
     assert abs(f.values[0][0] - 2.0) < 0.05 < 0.5 < abs(least_squares - 2.0)
     errors = left_out_errors(f, every[:, None] // 3)
     assert errors[:-1].max() < 2.5 and errors[-1] > 1000  # and it is judged as it is
+
+
+def test_a_fit_hops_to_the_deepest_of_minima_a_tick_apart() -> None:
+    class Ticks(Line):  # r is what |a - 4.05| and a ripple of period 1 make; minima at 0.05, 1.05, …
+        def residuals(self, terms, points, pick):
+            a = np.array([p[0][0] for p in points]) - 4.05
+            return np.broadcast_to(
+                (np.abs(a) + 3 * np.sin(np.pi * a) ** 2)[:, None, None], (len(points), len(pick), 40)
+            )
+
+    start, every = [np.array([1.0])], np.arange(20)
+    assert abs(fit(Ticks(), [SLOPE], start, every).values[0][0] - 1.05) < 0.2
+    assert abs(fit(Ticks(), [replace(SLOPE, hops=(1.0,))], start, every).values[0][0] - 4.05) < 0.01
 
 
 def test_a_gain_in_a_few_windows_is_credible_and_one_in_a_single_window_is_not() -> None:
