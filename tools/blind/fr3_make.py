@@ -17,7 +17,7 @@ from tools.blind.excite import plan, reference
 from tools.blind.fr3 import NUMERICS, Arm, Run, build, nominal, reality, simulate
 from tools.blind.fr3_draw import LEAST, redraw
 from tools.blind.library import EVERYTHING
-from tools.blind.make import TIMESTAMP_SD, Made
+from tools.blind.make import TIMESTAMP_SD, Made, label
 from tools.blind.plants import Array
 
 TICK = 0.004  # [s]
@@ -79,17 +79,7 @@ class _Bench:
             size = float(max(min(size, top), entry.smallest)) if np.isfinite(unit) else top
             if given.name == "actuator_delay":
                 size = float(np.ceil(size / self.numerics.step - 1e-9) * self.numerics.step)  # as it acts
-            truth.append(
-                {
-                    "name": given.name,
-                    "joint": given.joint,
-                    "size": size,
-                    "detectable": unit if np.isfinite(unit) else None,
-                    "multiple": size / unit if np.isfinite(unit) else 0.0,
-                    "parameters": entry.report(size, given.shape, scale),
-                    "alike": [],
-                }
-            )
+            truth.append(label(given, size, unit, scale, []))
         if not fits and not last:
             return None
         p = self.nominal

@@ -37,6 +37,28 @@ class Made(NamedTuple):
     floor: list[float]
 
 
+def label(given: Given, size: float, unit: float, scale: dict[str, float], others: list[list[str]]) -> dict[str, Any]:
+    """What the labels say of one effect.
+
+    Args:
+        given: As drawn.
+        size: Its own.
+        unit: Its detectable size; not finite if no size of it is.
+        scale: Of its joint (see library).
+        others: Names that the data cannot tell from it.
+    """
+    can = bool(np.isfinite(unit))
+    return {
+        "name": given.name,
+        "joint": given.joint,
+        "size": size,
+        "detectable": unit if can else None,
+        "multiple": size / unit if can else 0.0,
+        "parameters": EVERYTHING[given.name].report(size, given.shape, scale),
+        "alike": others,
+    }
+
+
 def make(cases: list[Case], progress: Callable[[float], object] = lambda n: None) -> list[Made]:
     """All cases, in their order. Those of one plant are simulated together.
 
@@ -322,18 +344,8 @@ class _Batch:
                 sd = 0.01 * scales[j]["F"]
                 columns[f"force/{name}"] = record.force[r, :count, j] + sd * rng.standard_normal(count)
             episodes.append(columns)
-        truth = []
-        for given, size, one, others in zip(case.effects, sizes, unit, same, strict=True):
-            parameters = EVERYTHING[given.name].report(size, given.shape, scales[given.joint])
-            truth.append(
-                {
-                    "name": given.name,
-                    "joint": given.joint,
-                    "size": size,
-                    "detectable": one if np.isfinite(one) else None,
-                    "multiple": size / one if np.isfinite(one) else 0.0,
-                    "parameters": parameters,
-                    "alike": others,
-                }
-            )
+        truth = [
+            label(given, size, one, scales[given.joint], others)
+            for given, size, one, others in zip(case.effects, sizes, unit, same, strict=True)
+        ]
         return Made(case, episodes, truth, [float(x) for x in self.floor[mine[0]]])
