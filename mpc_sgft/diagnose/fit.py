@@ -195,16 +195,9 @@ def _hop(problem: Residuals, flat: _Flat, x: Array, pick: Index) -> Array:
     A force follows its command at once: whether a late command comes before or after a sample changes what is read
     there, so that the error has a minimum between any two samples.
     """
-    around = np.concatenate([k * np.diag(flat.hops)[flat.hops > 0] for k in HOPS])
+    moves = np.concatenate([k * np.diag(flat.hops)[flat.hops > 0] for k in HOPS])
     scale = typical(problem.residuals(flat.terms, [flat.unpack(x)], pick)[0])
-    for _ in range(MOST_STEPS):
-        tries = [x, *(flat.clip(x + a) for a in around)]
-        costs = robust(problem.residuals(flat.terms, [flat.unpack(t) for t in tries], pick), scale)
-        best = int(np.argmin(costs))
-        if costs[best] >= (1 - TOLERANCE) * costs[0]:
-            break
-        x = tries[best]
-    return x
+    return _best_nearby(problem, flat, x, pick, moves, scale)
 
 
 def _walk(problem: Residuals, flat: _Flat, x: Array, pick: Index) -> Array:
@@ -215,14 +208,20 @@ def _walk(problem: Residuals, flat: _Flat, x: Array, pick: Index) -> Array:
     """
     scale = typical(problem.residuals(flat.terms, [flat.unpack(x)], pick)[0])
     for size in problem.pattern:
-        around = size * np.concatenate([np.zeros((1, flat.count)), np.eye(flat.count), -np.eye(flat.count)])
-        for _ in range(MOST_STEPS):
-            tries = [flat.clip(x + a) for a in around]
-            costs = robust(problem.residuals(flat.terms, [flat.unpack(t) for t in tries], pick), scale)
-            best = int(np.argmin(costs))
-            if costs[best] >= (1 - TOLERANCE) * costs[0]:
-                break
-            x = tries[best]
+        moves = size * np.concatenate([np.eye(flat.count), -np.eye(flat.count)])
+        x = _best_nearby(problem, flat, x, pick, moves, scale)
+    return x
+
+
+def _best_nearby(problem: Residuals, flat: _Flat, x: Array, pick: Index, moves: Array, scale: float) -> Array:
+    """To the best of the points at these moves [M, P] from here, while that is better."""
+    for _ in range(MOST_STEPS):
+        tries = [x, *(flat.clip(x + m) for m in moves)]
+        costs = robust(problem.residuals(flat.terms, [flat.unpack(t) for t in tries], pick), scale)
+        best = int(np.argmin(costs))
+        if costs[best] >= (1 - TOLERANCE) * costs[0]:
+            break
+        x = tries[best]
     return x
 
 

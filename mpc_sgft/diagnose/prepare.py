@@ -221,8 +221,9 @@ def scales(plant: Plant, replayer: Replayer) -> dict[tuple[str, str], Scales]:
         forces.append(np.abs(full @ a[k]) + np.abs(data.qfrc_bias) + np.abs(data.qfrc_actuator))
         peak = np.maximum(peak, np.abs(data.actuator_force))
         for contact in data.contact:
-            moves = [g for g in contact.geom if m.body_weldid[m.geom_bodyid[g]]]
-            touching[m.geom(moves[0]).name] = float(contact.friction[0])
+            moves = [g for g in contact.geom if g >= 0 and m.body_weldid[m.geom_bodyid[g]]]
+            for g in moves[:1]:  # none where a listed pair touches without moving
+                touching[m.geom(g).name] = float(contact.friction[0])
     force = np.sqrt(np.mean(np.square(forces), 0)) + 1e-9
     inertia = np.mean(inertias, 0)
     speed, travel = np.sqrt(np.mean(v**2, 0)) + 1e-6, np.std(q, 0) + 1e-6
