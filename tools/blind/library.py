@@ -80,13 +80,11 @@ def _stribeck_numbers(size: float, shape: Shape, scales: Scales) -> tuple[float,
 
 
 def _stribeck(p: dict[str, Array], rows: Array, joint: int, size: float, shape: Shape, scales: Scales) -> None:
-    """LuGre; dry friction that the model knows of becomes part of it."""
+    """LuGre, beside the dry friction that the model knows of."""
     kinetic, static, speed = _stribeck_numbers(size, shape, scales)
-    dry = p["c_pos"][rows, joint].copy()
-    p["c_pos"][rows, joint] = p["c_neg"][rows, joint] = 0.0
-    p["kinetic"][rows, joint], p["static"][rows, joint] = dry + kinetic, dry + static
+    p["kinetic"][rows, joint], p["static"][rows, joint] = kinetic, static
     p["stribeck_speed"][rows, joint] = speed
-    p["bristle"][rows, joint] = (dry + kinetic) / (1.5e-4 * scales["top"])  # as stiff as the step allows at top speed
+    p["bristle"][rows, joint] = kinetic / (1.5e-4 * scales["top"])  # as stiff as the step allows at top speed
     p["bristle_damping"][rows, joint] = 0.4 * np.sqrt(p["bristle"][rows, joint] * scales["J"])
 
 

@@ -3,11 +3,13 @@
 import numpy as np
 
 from tools.blind.integrate import Integrator, start
+from tools.blind.library import LIBRARY
 from tools.blind.loop import H
 from tools.blind.plants import PLANTS
 from tools.blind.truths import Forces, rows
 
 SLIDE = PLANTS["slide"]
+SCALES = {"V": 0.1, "top": 0.3, "J": 4.0}
 BLOCK = {"m": 3.0, "armature": [1.0], "damping": [0.0], "dry": [2.0], "gear": [10.0], "limit": [1e9]}
 
 
@@ -80,3 +82,15 @@ def test_lugre_settles_on_the_stribeck_curve() -> None:
         z = z + 1e-5 * forces.bending(speeds, z)
     curve = np.sign(speeds) * (1.0 + 0.6 * np.exp(-((speeds / 0.05) ** 2)))
     assert np.allclose(forces.resistance(np.zeros_like(z), speeds, z), curve, rtol=1e-3)
+
+
+def test_what_stribeck_friction_does_vanishes_with_its_size_beside_known_dry_friction() -> None:
+    p, sizes = rows(SLIDE, BLOCK, 4), (0.0, 1e-4, 1e-2, 1e-1)
+    for row, size in enumerate(sizes[1:], 1):
+        LIBRARY["stribeck_friction"].apply(p, np.array([row]), 0, size, {"ratio": 0.5, "speed": 0.5}, SCALES)
+    integrator, state = Integrator(SLIDE, p, H), start(np.zeros((4, 1)), np.full((4, 1), 0.2))
+    for k in range(4000):  # to rest and back
+        u = np.full((4, 1), -0.3 * np.sin(3 * k * H))
+        state = integrator.step(state, (u, u, u), k * H)
+    moved = np.abs(state.y[0, 1:, 0] - state.y[0, 0, 0])
+    assert np.all(np.diff(moved) > 0) and moved[0] < 0.02 * moved[2]
