@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mpc_sgft.diagnose.fit import Fit, left_out_errors, window_errors
+from mpc_sgft.diagnose.fit import Fit, by_parts, left_out_errors, window_errors
 from mpc_sgft.diagnose.library import Term
 from mpc_sgft.diagnose.prepare import Setup
 from mpc_sgft.diagnose.record import Array
@@ -22,12 +22,14 @@ class Entry(NamedTuple):
         fit: Nominal terms and effects.
         effects: Number of effects; they are the last terms.
         errors: Error of every part of every window when that is not fitted, [(W fitted + W held) parts].
+        fitted: The same with the fitted windows as they were fitted.
         complexity: Parameters of the effects that change anything.
     """
 
     fit: Fit
     effects: int
     errors: Array
+    fitted: Array
     complexity: int
 
     @property
@@ -60,17 +62,21 @@ class Entry(NamedTuple):
 def entry(setup: Setup[Any], f: Fit) -> Entry:
     """Judge a fit on all windows: fitted ones by leaving out their block, the others as they are.
 
-    One of a few windows may hold all that shows an effect. Then its parts are left out one by one, if the rest of it
-    foretells them but for noise.
+    Leaving out is to first order. Where that foretells more than the fit and no effect do, the rest of the data do not
+    determine the effect, and none is foretold. One of a few windows may hold all that shows an effect. Then its parts
+    are left out one by one, if the rest of it foretells them but for noise.
     """
     nominal = len(setup.baseline.terms)
     held = window_errors(setup.problem, f, setup.held, setup.parts)
     blocks = np.repeat(setup.blocks[:, None], setup.parts, axis=1)
     each = np.arange(blocks.size).reshape(blocks.shape)
-    by_part, errors = (setup.judged(np.concatenate([left_out_errors(f, b), held])) for b in (each, blocks))
+    left_in = by_parts(f.r**2, setup.parts)
+    most = np.maximum(left_in, by_parts(setup.baseline.r**2, setup.parts)) if len(f.terms) > nominal else np.inf
+    left_out = (np.minimum(left_out_errors(f, b), most) for b in (each, blocks))
+    by_part, errors, fitted = (setup.judged(np.concatenate([x, held])) for x in (*left_out, left_in))
     if setup.one_window(by_part):
         errors = by_part
     ends = np.cumsum([len(t.size) for t in f.terms])
     norms = np.split(np.sqrt((f.J**2).sum((0, 1))), ends[:-1])[nominal:]  # of each effect's parameters
     seen = sum(int((own > SEEN * max(float(own.max()), 1e-12)).sum()) for own in norms if len(own))
-    return Entry(f, len(f.terms) - nominal, errors, seen)
+    return Entry(f, len(f.terms) - nominal, errors, fitted, seen)

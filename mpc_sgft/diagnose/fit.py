@@ -89,14 +89,27 @@ class Residuals(Protocol):
         ...
 
 
+class Discrepancy(NamedTuple):
+    """How far predictions of the right model are off, at every sample of every window.
+
+    Attributes:
+        known: What the simulator's time step leaves out, to be added to predictions, [W, n, S].
+        floor: What may be off beyond that, with its sign, terms [F, W, n, S] that add up in squares.
+        doubt: Of each sample, beyond its noise, [W, n, S]; as large for its neighbours.
+    """
+
+    known: Array
+    floor: Array
+    doubt: Array
+
+
 class Problem:
     """Residuals of structures over windows.
 
     Args:
         replayer: Simulates.
         sigma: Noise of each signal, one sample, [S].
-        floor: Error of the simulator itself, with its sign, terms [F, W, n, S] that add up in squares.
-        doubt: Of each sample, beyond its noise, [W, n, S]; as large for its neighbours.
+        own: Errors of the simulator itself.
         start_sd: Uncertainty of each window's start, [W, 2 nj]; projected out.
         sensitivity: Derivative of the predictions by the start, [W, n, S, 2 nj].
 
@@ -106,18 +119,16 @@ class Problem:
 
     step, pattern = STEP, ()
 
-    def __init__(
-        self, replayer: Replayer, sigma: Array, floor: Array, doubt: Array, start_sd: Array, sensitivity: Array
-    ):
+    def __init__(self, replayer: Replayer, sigma: Array, own: Discrepancy, start_sd: Array, sensitivity: Array):
         self.replayer, self.sigma = replayer, sigma
         n = replayer.windows.samples
         self.stride = max(1, n // MAX_POINTS)
         self.blocks = n // self.stride
-        self.target = self._average(replayer.windows.measured)
+        self.target = self._average(replayer.windows.measured - own.known)
         noise = sigma / np.sqrt(self.stride)
-        own = np.minimum((self._average(floor) ** 2).sum(0), (MOST_FLOOR * noise) ** 2)
-        self.scale = np.sqrt(noise**2 + own + self._average(doubt) ** 2)
-        self.floor_share = (own / self.scale**2).reshape(len(self.scale), -1)
+        floor = np.minimum((self._average(own.floor) ** 2).sum(0), (MOST_FLOOR * noise) ** 2)
+        self.scale = np.sqrt(noise**2 + floor + self._average(own.doubt) ** 2)
+        self.floor_share = (floor / self.scale**2).reshape(len(self.scale), -1)
         moved = self._average(np.moveaxis(sensitivity, -1, 0)) / self.scale  # [2 nj, W, nb, S]
         a = moved.reshape(*moved.shape[:2], -1).transpose(1, 2, 0) * start_sd[:, None]  # [W, m, 2 nj]
         self.u, s, _ = np.linalg.svd(a, full_matrices=False)

@@ -70,17 +70,15 @@ def credible(
     return g.low > 0 and g.mean > max(least, MIN_SHARE * float(worse.mean())) and bool(elsewhere > ELSEWHERE)
 
 
-def worse(rival: Array, best: Array, rng: np.random.Generator, points: float = 0.0) -> bool:
+def worse(rival: Array, best: Array, rng: np.random.Generator, odds: float = 0.0) -> bool:
     """Whether a rival of the same size can be ruled out.
 
     Args:
         rival, best: Errors of the same parts of windows, [W].
         rng: For the bootstrap.
-        points: Independent residuals of each part if the best leaves noise alone, so that their squares are
-            likelihoods; 0 if it does not.
+        odds: Logarithm of how much likelier the data are with the best, 0 if that is not known.
     """
     g = gain(rival, best, 2 * TIE_LEVEL - 1, rng)
-    odds = points * (np.expm1(rival) - np.expm1(best)).sum() / 2
     return g.mean > TIE_GAIN and bool(g.low > 0 or odds > np.log(TIE_ODDS))
 
 

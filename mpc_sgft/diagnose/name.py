@@ -12,12 +12,13 @@ from mpc_sgft.diagnose import judge
 from mpc_sgft.diagnose.entry import Entry, entry
 from mpc_sgft.diagnose.fit import fit
 from mpc_sgft.diagnose.flexible import Flexible
+from mpc_sgft.diagnose.library import HIDDEN
 from mpc_sgft.diagnose.prepare import ABOVE_NOISE, NOISE, Setup
 from mpc_sgft.diagnose.record import Array
 from mpc_sgft.diagnose.table import EQUIVALENT, Equivalence
 
 UNEXPLAINED = 0.05  # share of what any model can explain that named effects may miss before the answer is "unknown"
-NEXT_GAIN = 0.1  # in log(1 + e), of one more effect where noise alone is left
+NEXT_GAIN = 0.06  # in log(1 + e), of one more effect where noise alone is left
 WIDER = 1.3  # of intervals: what windows that begin at each other's ends share; set on development seeds
 EXPLAINED = 0.75  # share of the error above noise that names must explain
 
@@ -41,11 +42,11 @@ class Verdict(NamedTuple):
 
 
 def choose(setup: Setup[Any], entries: list[Entry], rng: np.random.Generator) -> Entry:
-    """The smallest set that no larger one credibly beats."""
+    """The smallest set that no larger one credibly beats; of several effects, each must be away from none."""
     current = entries[0]
     while True:
         larger = [e for e in entries if e.complexity > current.complexity and e.error < current.error]
-        better = [e for e in larger if gains(setup, current, e, rng)]
+        better = [e for e in larger if gains(setup, current, e, rng) and (e.effects < 2 or distinct(e))]
         if not better:
             return prune(setup, current, entries, rng)
         smallest = min(e.complexity for e in better)
@@ -57,6 +58,15 @@ def gains(setup: Setup[Any], small: Entry, large: Entry, rng: np.random.Generato
     noise_alone = small.error < setup.quiet or bool(small.effects) and settled(small)
     least = NEXT_GAIN if noise_alone else judge.MIN_GAIN
     return judge.credible(small.errors, large.errors, rng, setup.parts, least, setup.one_window(large.errors))
+
+
+def distinct(e: Entry) -> bool:
+    """Whether a parameter of each effect is credibly away from no effect."""
+    limits = zip(e.terms, intervals(e, 2 * judge.GAIN_LEVEL - 1), strict=True)
+    return all(
+        np.any((low > t.neutral) | (high < t.neutral), where=[n not in HIDDEN for n in t.names])
+        for t, (low, high) in limits
+    )
 
 
 def prune(setup: Setup[Any], best: Entry, entries: list[Entry], rng: np.random.Generator) -> Entry:
@@ -120,10 +130,19 @@ def judge_entries(
 
 
 def find_ties(setup: Setup[Any], best: Entry, entries: list[Entry], rng: np.random.Generator) -> list[Entry]:
-    """Sets no larger than the best that are not credibly worse, best first."""
-    rivals = [e for e in entries if e is not best and 0 < e.complexity <= best.complexity and e.effects]
-    points = setup.problem.blocks / setup.parts if settled(best) else 0.0  # of one signal: noise is not quite white
-    return sorted((e for e in rivals if not judge.worse(e.errors, best.errors, rng, points)), key=lambda e: e.error)
+    """Sets of no more names and parameters than the best that are not credibly worse, best first."""
+    rivals = [e for e in entries if 0 < e.complexity <= best.complexity and 0 < e.effects <= best.effects]
+    tied = [e for e in rivals if e is not best and not judge.worse(e.errors, best.errors, rng, odds(setup, best, e))]
+    return sorted(tied, key=lambda e: e.error)
+
+
+def odds(setup: Setup[Any], best: Entry, rival: Entry) -> float:
+    """Logarithm of how much likelier the data are with the best than with a rival; 0 where it leaves more than noise.
+
+    Of one signal's independent residuals: noise is not quite white.
+    """
+    points = setup.problem.blocks / setup.parts if settled(best) else 0.0
+    return points * float((np.expm1(rival.fitted) - np.expm1(best.fitted)).sum()) / 2
 
 
 def equivalence(a: Entry, b: Entry) -> Equivalence | None:

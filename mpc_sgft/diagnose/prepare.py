@@ -9,7 +9,7 @@ from typing import Any, Generic, TypeVar
 import mujoco
 import numpy as np
 
-from mpc_sgft.diagnose.fit import Fit, Problem, Residuals, by_parts, change_of, fit
+from mpc_sgft.diagnose.fit import Discrepancy, Fit, Problem, Residuals, by_parts, change_of, fit
 from mpc_sgft.diagnose.library import Term
 from mpc_sgft.diagnose.plant import Plant, joint_of
 from mpc_sgft.diagnose.record import Array, Episode, Index
@@ -24,9 +24,9 @@ UNITS = 24  # parts of windows to compare sets on, at least
 FEW_WINDOWS = 7  # fewer: one may hold all that shows an effect
 BLOCKS = 8  # into which the fitted windows are split for leaving out
 NOISE = float(np.log(2.0))  # log(1 + e) of a window whose error is noise alone, e = 1
-QUIET = 0.1  # in log(1 + e): below this above the noise's, no further effect is searched for
+QUIET = 0.05  # in log(1 + e): below this above the noise's, no further effect is searched for
 ABOVE_NOISE = 0.25  # in log(1 + e): an error that is no more above the noise's needs no further name
-KICK = 1e-4  # of the typical size, to differentiate by the start
+KICK = 1e-4  # of the typical size, to differentiate by the start, at least
 
 
 P = TypeVar("P", bound=Residuals)
@@ -101,12 +101,13 @@ def prepare(
     fitted, held = split(replayer, held_out)
     noise = np.array([np.median([noise_of(e.signals[s]) for e in episodes]) for s in chosen])
     shape = replayer.windows.measured.shape
-    first = _problem(replayer, noise, np.zeros((0, *shape)), np.zeros(shape), [], [])
+    nothing = np.zeros(shape)
+    first = _problem(replayer, noise, Discrepancy(nothing, np.zeros((0, *shape)), nothing), [], [])
     base = fit(first, nominal, [t.neutral for t in nominal], fitted)
     missed = replayer.windows.measured - replayer.simulate([change_of(nominal, base.values)])[0]
     noise = np.minimum(noise, [np.median([noise_of(x) for x in missed[..., i]]) for i in range(len(chosen))])
-    floor, doubt = simulator_floor(plant, episodes, replayer, nominal, base.values)
-    problem = _problem(replayer, noise, floor, doubt, nominal, base.values)
+    own = discrepancy(plant, episodes, replayer, nominal, base.values)
+    problem = _problem(replayer, noise, own, nominal, base.values)
     base = fit(problem, nominal, base.values, fitted)
     parts = max(1, -(-UNITS // len(replayer.windows.start)))
     blocks = cut(len(fitted))
@@ -115,7 +116,9 @@ def prepare(
     def judged(errors: Array) -> Array:
         return np.log1p(np.maximum(errors, least))
 
-    return Setup(problem, fitted, held, blocks, base, noise, np.median(floor[0], (0, 1)), judged, NOISE + QUIET, parts)
+    return Setup(
+        problem, fitted, held, blocks, base, noise, np.median(own.floor[0], (0, 1)), judged, NOISE + QUIET, parts
+    )
 
 
 def cut(fitted: int) -> Index:
@@ -156,49 +159,52 @@ def split(replayer: Any, held_out: float | Sequence[str] | None) -> tuple[Index,
     return everything[~apart], everything[apart]
 
 
-def simulator_floor(
+def discrepancy(
     plant: Plant, episodes: Sequence[Episode], replayer: Replayer, terms: Sequence[Term], values: Sequence[Array]
-) -> tuple[Array, Array]:
-    """How far a prediction may be off although the model is right, at every sample of every window: the simulator's own
-    error, [2, W, n, S], and the doubt about readings of scattered stamps, [W, n, S].
+) -> Discrepancy:
+    """How far predictions are off although the model is right.
 
-    By the simulator's time step: half of it changes the prediction by three quarters of a second-order error, or half
-    of a first-order one, which dry friction makes where a motion reverses; what is off once in a window is taken to
-    stay off. By the clock: a force follows its command at once, and may have been read before or after that changed;
-    always the one, or, where stamps scattered, now the one and now the other.
+    By the simulator's time step: what steps a quarter as long change is taken off; what is left of a second-order error
+    is less than the last halving changed, and as much of a first-order one, which dry friction makes where a motion
+    reverses. What is off once in a window is taken to stay off. By the clock: a force follows its command at once, and
+    may have been read before or after that changed; always the one, or, where stamps scattered, now the one and now the
+    other.
     """
-    spec = plant.spec.copy()
-    spec.option.timestep = plant.model.opt.timestep / 2
-    w = replayer.windows
-    finer = Replayer(Plant(spec), episodes, w.samples * replayer.dt, replayer.signals)
-    change = change_of(terms, values)
-    predicted = replayer.simulate([change])[0]
-    step = np.maximum.accumulate(np.abs(finer.simulate([change])[0] - predicted), 1) * 2
+    w, change = replayer.windows, change_of(terms, values)
+
+    def simulate(share: int) -> Array:
+        """In steps of this share."""
+        spec = plant.spec.copy()
+        spec.option.timestep = plant.model.opt.timestep / share
+        return Replayer(Plant(spec), episodes, w.samples * replayer.dt, replayer.signals).simulate([change])[0]
+
+    predicted, half, quarter = replayer.simulate([change])[0], simulate(2), simulate(4)
+    step = np.maximum.accumulate(np.abs(quarter - half), 1)
     clock = predicted - replayer.read_early().simulate([change])[0]
     loose = np.array([episodes[i].scattered for i in w.episode])[:, None, None]
-    return np.stack([step, np.where(loose, 0.0, clock)]), np.where(loose, np.abs(clock) / 2, 0.0)
+    floor = np.stack([step, np.where(loose, 0.0, clock)])
+    return Discrepancy(quarter - predicted, floor, np.where(loose, np.abs(clock) / 2, 0.0))
 
 
 def _problem(
     replayer: Replayer,
     noise: Array,
-    floor: Array,
-    doubt: Array,
+    own: Discrepancy,
     terms: Sequence[Term],
     values: Sequence[Array],
 ) -> Problem:
     w = replayer.windows
     starts = [(replayer.smooth[i], k) for i, k in zip(w.episode, w.start, strict=True)]
-    sd = np.array([np.concatenate([s.q_sd, s.v_sd[k]]) for s, k in starts])
+    sd = np.array([np.concatenate([s.q_sd[k], s.v_sd[k]]) for s, k in starts])
     speed = np.sqrt(np.mean(w.v0**2, 0)) + 1e-6
     travel = np.ptp(w.q0, axis=0) + 1e-6
-    kick = KICK * np.concatenate([travel, speed])
+    kick = np.maximum(KICK * np.concatenate([travel, speed]), np.median(sd, 0))
     change = change_of(terms, values)
     shifts = np.concatenate([np.diag(kick), -np.diag(kick)])
     y = replayer.simulate([change] * len(shifts), shift=shifts)
     half = len(kick)
     sensitivity = np.moveaxis((y[:half] - y[half:]) / (2 * kick[:, None, None, None]), 0, -1)
-    return Problem(replayer, noise, floor, doubt, sd, sensitivity)
+    return Problem(replayer, noise, own, sd, sensitivity)
 
 
 def scales(plant: Plant, replayer: Replayer) -> dict[tuple[str, str], Scales]:

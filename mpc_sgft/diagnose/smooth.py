@@ -20,7 +20,7 @@ class Smooth(NamedTuple):
     Attributes:
         q, v, a: Position, velocity and acceleration at the samples.
         noise: Standard deviation of the position noise.
-        q_sd, v_sd: How uncertain q [nj] and v [T, nj] are, but for the ends; more where the velocity has corners.
+        q_sd, v_sd: How uncertain q and v are, [T, nj], but for the ends; more where the motion has corners.
         half: Samples at either end of the episode where they are more uncertain, a number.
     """
 
@@ -57,29 +57,32 @@ def smooth(episode: Episode, joints: Sequence[str]) -> Smooth:
 
 def _one(q: Array, measured_v: Array | None, dt: float) -> tuple[Array, ...]:
     noise = noise_of(q)
-    best = None
-    previous = None
-    for half in (h for h in HALF_WIDTHS if 2 * h + 1 < len(q) // 2):
-        width = 2 * half + 1
-        v = np.asarray(savgol_filter(q, width, 3, deriv=1, delta=dt), float)
-        spread = noise * float(np.linalg.norm(savgol_coeffs(width, 3, deriv=1, delta=dt)))
-        bias = np.zeros(len(q)) if previous is None else v - previous
-        error = np.hypot(spread, float(np.sqrt(np.mean(bias**2))))
-        if best is None or error < best[0]:
-            best = (error, width, v, np.maximum(error, np.hypot(spread, _nearby(bias, width))))
-        previous = v
-    assert best is not None, ("too few samples to smooth", len(q))
-    error, width, v, v_sd = best
+    level, q_sd, _ = _best(q, noise, dt, 0)
+    v, v_sd, width = _best(q, noise, dt, 1)
     wide = min(2 * width + 1, (len(q) // 2) * 2 - 1)
     a = np.asarray(savgol_filter(q, max(wide, 5), 3, deriv=2, delta=dt), float)
-    level = np.asarray(savgol_filter(q, width, 3), float)
-    q_sd = noise * float(np.linalg.norm(savgol_coeffs(width, 3)))
     if measured_v is not None:
         own = noise_of(measured_v)
         lag = float(np.clip(np.sum((v - measured_v) * a) / max(np.sum(a * a), 1e-30), -dt, dt))
-        if own < error:
+        if own < np.sqrt(np.mean(v_sd**2)):
             v, v_sd = measured_v + lag * a, np.full(len(q), own)
-    return level, v, a, np.array(noise), np.array(q_sd), v_sd, np.array(width // 2)
+    return level, v, a, np.array(noise), q_sd, v_sd, np.array(width // 2)
+
+
+def _best(q: Array, noise: float, dt: float, order: int) -> tuple[Array, Array, int]:
+    """A derivative of [T] by the width whose error is least, how uncertain it is [T], and the width.
+
+    How much a width bends the motion shows against the next narrower one, and for the narrowest against the next wider.
+    """
+    widths = [2 * half + 1 for half in HALF_WIDTHS if 2 * half + 1 < len(q) // 2]
+    assert widths, ("too few samples to smooth", len(q))
+    x = [np.asarray(savgol_filter(q, w, 3, deriv=order, delta=dt), float) for w in widths]
+    spread = [noise * float(np.linalg.norm(savgol_coeffs(w, 3, deriv=order, delta=dt))) for w in widths]
+    bent = [np.zeros(len(q)), *np.diff(x, axis=0)]
+    error = [float(np.hypot(s, np.sqrt(np.mean(b**2)))) for s, b in zip(spread, bent, strict=True)]
+    best = int(np.argmin(error))
+    nearby = _nearby(bent[max(best, min(1, len(widths) - 1))], widths[best])
+    return x[best], np.maximum(error[best], np.hypot(spread[best], nearby)), widths[best]
 
 
 def _nearby(x: Array, width: int) -> Array:

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from mpc_sgft.diagnose import judge
-from mpc_sgft.diagnose.entry import entry
-from mpc_sgft.diagnose.fit import by_parts, fit, left_out_errors
+from mpc_sgft.diagnose.entry import Entry, entry
+from mpc_sgft.diagnose.fit import Fit, by_parts, fit, left_out_errors
 from mpc_sgft.diagnose.library import Term
+from mpc_sgft.diagnose.name import distinct, odds
 from mpc_sgft.diagnose.plant import Change
 from mpc_sgft.diagnose.prepare import Setup, cut
 
@@ -97,6 +98,30 @@ def test_one_of_few_windows_shows_an_effect_if_it_foretells_its_parts_but_for_no
     assert (judged.errors[16:24].max() < 1.5) == trusted
 
 
+def test_what_the_rest_of_the_data_do_not_determine_is_not_foretold() -> None:
+    line, fitted, none = Line(), np.arange(8), np.zeros(1)
+    line.x[1:9] *= 1e-3  # the first window alone shows the slope
+    line.y[1:9] = np.random.default_rng(1).normal(size=(8, 40))
+    f, base = fit(line, [SLOPE], [SLOPE.starts[0]], fitted), fit(line, [], [], fitted)
+    setup = Setup(line, fitted, np.array([8]), cut(8), base, none, none, np.log1p)
+    assert np.log1p(left_out_errors(f, cut(8)[:, None]))[0] > 2 * entry(setup, base).errors[0]
+    assert entry(setup, f).errors[0] == entry(setup, base).errors[0]
+
+
+def test_of_several_effects_each_must_be_credibly_away_from_none() -> None:
+    line, every, none = Line(), np.arange(19), np.zeros(1)
+    base, rng = fit(line, [], [], every), np.random.default_rng(5)
+    setup = Setup(line, every, np.array([19]), cut(19), base, none, none, np.log1p)
+
+    def second(x: np.ndarray) -> Entry:
+        """The slope, and an effect with these derivatives [19, 40] that is found to be 1."""
+        f = fit(line, [SLOPE], [np.full(1, 2.0)], every)
+        both = (*f.terms, replace(SLOPE, effect="other"))
+        return entry(setup, Fit(both, (*f.values, np.ones(1)), f.r, np.concatenate([f.J, x[..., None]], 2)))
+
+    assert distinct(second(rng.normal(size=(19, 40)))) and not distinct(second(0.01 * rng.normal(size=(19, 40))))
+
+
 def test_parts_by_hand() -> None:
     squares = np.array([[1.0, 3.0, 5.0, 7.0, 9.0], [0.0, 0.0, 1.0, 1.0, 1.0]])
     np.testing.assert_allclose(by_parts(squares, 2), [2.0, 7.0, 0.0, 1.0])
@@ -110,13 +135,15 @@ def test_a_rival_that_is_worse_by_next_to_nothing_ties_however_surely_it_is_wors
 
 
 def test_where_noise_alone_is_left_a_rival_is_ruled_out_by_its_odds() -> None:
-    rng = np.random.default_rng(0)
-    best = np.log1p(rng.chisquare(10, 24) / 10)
-    rival = best + np.where(np.arange(24) == 0, 0.6, 0.0) + 0.05 * rng.normal(size=24)  # one part shows it
-    apart = 10 * (np.expm1(rival) - np.expm1(best)).sum()
-    assert not judge.worse(rival, best, rng) and apart > 2 * np.log(20)
-    assert judge.worse(rival, best, rng, points=10)
-    assert not judge.worse(rival, best, rng, points=10 * np.log(20) / apart)
+    line, every, none = Line(), np.arange(19), np.zeros(1)
+    base, rng = fit(line, [], [], every), np.random.default_rng(0)
+    setup = Setup(line, every, np.array([18]), cut(19), base, none, none, np.log1p)
+    best, rival = (entry(setup, fit(line, [SLOPE], [np.full(1, a)], every, 0)) for a in (2.0, 2.05))
+    apart = ((2.05 * line.x - line.y) ** 2 - (2.0 * line.x - line.y) ** 2)[[*range(19), 18]].sum() / 2
+    assert odds(setup, best, rival) == pytest.approx(apart)
+    even, one = np.zeros(24), np.where(np.arange(24) == 0, 0.6, 0.0)
+    assert not judge.worse(one, even, rng) and not judge.worse(one, even, rng, odds=np.log(19))
+    assert judge.worse(one, even, rng, odds=np.log(21))
 
 
 class Rugged(Line):

@@ -10,7 +10,7 @@ import pytest
 
 from mpc_sgft.diagnose.library import candidates, enrich, make_term
 from mpc_sgft.diagnose.plant import Change, Plant
-from mpc_sgft.diagnose.prepare import prepare, scales, simulator_floor
+from mpc_sgft.diagnose.prepare import discrepancy, prepare, scales
 from mpc_sgft.diagnose.record import Episode
 from mpc_sgft.diagnose.replay import Replayer, held_mean
 from mpc_sgft.diagnose.smooth import smooth
@@ -37,6 +37,19 @@ def test_a_right_model_predicts_to_the_second_order(plant) -> None:
     replayer = Replayer(plant, [_sine()], 0.5, ["qpos/x"])
     error = replayer.simulate([Change()])[0] - replayer.windows.measured
     assert np.abs(error).max() < 3e-6  # the first order alone would be h a t / 2 = 5e-4 m
+
+
+def test_what_shorter_steps_would_change_is_known() -> None:
+    """Beside dry friction that a motion reverses against, an error of the first order."""
+    spec = mujoco.MjSpec.from_string(SLIDE.replace('axis="1 0 0"/>', 'axis="1 0 0" frictionloss="1"/>'))
+    plant, fine = Plant(spec).sharper(), Plant(spec).sharper().spec.copy()
+    fine.option.timestep = 1e-5
+    episode = replace(_sine(), ctrl=3 * np.cos(9 * 0.001 * np.arange(2000))[:, None])
+    coarse, true = (Replayer(p, [episode], 0.5, ["qpos/x"]) for p in (plant, Plant(fine)))
+    off = coarse.simulate([Change()])[0] - true.simulate([Change()])[0]
+    known, floor, _ = discrepancy(plant, [episode], coarse, [], [])
+    assert np.abs(off + known).max() < 0.3 * np.abs(off).max()
+    assert (np.abs(off + known) <= floor[0] + 1e-12).mean() > 0.95
 
 
 def test_held_mean_by_hand() -> None:
@@ -109,7 +122,7 @@ def test_a_force_may_have_been_read_before_its_command(servo, scattered: bool) -
     plant, episode, _ = servo
     episode = replace(episode, scattered=scattered)
     replayer = Replayer(plant, [episode], 0.4, ["qpos/x", "force/servo"])
-    floor, doubt = simulator_floor(plant, [episode], replayer, [], [])
+    _, floor, doubt = discrepancy(plant, [episode], replayer, [], [])
     w, jump = replayer.windows, 4000.0 * np.diff(episode.ctrl[:, 0], prepend=0.0)
     jumps = np.array([jump[s + 1 : s + 1 + w.samples] for s in w.start])
     often, always = (np.abs(jumps) / 2, 0 * jumps) if scattered else (0 * jumps, jumps)
@@ -240,3 +253,13 @@ def test_a_start_at_a_corner_of_the_velocity_is_more_uncertain_than_elsewhere() 
     off = (np.abs(s.v - true[:, None]) / s.v_sd)[s.half : -s.half]
     assert (off < 3).mean() > 0.97 and off.max() < 10  # at the corner, where the velocity jumps, it was up to 23
     assert s.v_sd[240:260].min() > 1.5 * s.v_sd[110:140].max()
+
+
+def test_a_position_is_as_uncertain_as_its_smoothing_bends_it() -> None:
+    t = np.arange(2000) * 0.002
+    true = 0.1 * np.abs(np.sin(4 * t))  # bounces
+    q = true + 1e-5 * np.random.default_rng(0).standard_normal(len(t))
+    speed = 0.4 * np.cos(4 * t) * np.sign(np.sin(4 * t)) + 0.2 * np.random.default_rng(1).standard_normal(len(t))
+    s = smooth(Episode("a", 0.002, np.zeros((2000, 1)), {"qpos/x": q, "qvel/x": speed}), ["x"])
+    off = (np.abs(s.q[:, 0] - true) / s.q_sd[:, 0])[s.half : -s.half]
+    assert (off < 3).mean() > 0.97 and off.max() < 10, (np.mean(off < 3), off.max())

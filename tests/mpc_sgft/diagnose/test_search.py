@@ -93,8 +93,8 @@ def test_where_noise_alone_is_left_an_effect_must_gain_more() -> None:
         small, large = (base._replace(errors=x + scatter) for x in (before, before - gain - scatter))
         return gains(setup, small, large, rng)
 
-    assert not better(0.65, 0.07) and better(0.65, 0.15)
-    assert better(0.95, 0.07)
+    assert not better(0.65, 0.045) and better(0.65, 0.1)
+    assert better(0.95, 0.045)
 
 
 def test_gravity_may_turn_about_one_axis_or_both() -> None:
