@@ -20,7 +20,8 @@ from mpc_sgft.diagnose.table import EQUIVALENT, Equivalence
 UNEXPLAINED = 0.05  # share of what any model can explain that named effects may miss before the answer is "unknown"
 NEXT_GAIN = 0.06  # in log(1 + e), of one more effect where noise alone is left
 WIDER = 1.3  # of intervals: what windows that begin at each other's ends share; set on development seeds
-EXPLAINED = 0.75  # share of the error above noise that names must explain
+EXPLAINED = 0.85  # share of the squared error above noise that names must explain ...
+NEAR = 1.0  # ... unless they leave no more than this, in squares of noise
 
 
 class Verdict(NamedTuple):
@@ -119,7 +120,7 @@ def judge_entries(
             reason = f"nothing explains the rest, {times:.1f} times noise and floor, on windows that were not fitted"
         return Verdict("none", best, [], probability, reason)
     left = np.expm1(best.error) - 1.0
-    if not settled(best) and left > (1 - EXPLAINED) * (np.expm1(base.error) - 1.0):
+    if left > max(NEAR, (1 - EXPLAINED) * (np.expm1(base.error) - 1.0)):
         reason = f"{_list(best)} leaves {times:.1f} times noise and floor, which no name in the library explains"
         return Verdict("unknown", best, [(e, "" if q is None else q.reason) for e, q in declared], probability, reason)
     best, open_ties = canonical(best, declared)

@@ -13,7 +13,7 @@ from mpc_sgft.diagnose import search as searching
 from mpc_sgft.diagnose.entry import entry
 from mpc_sgft.diagnose.fit import fit
 from mpc_sgft.diagnose.library import Term, as_gap, candidates, settings
-from mpc_sgft.diagnose.name import gains
+from mpc_sgft.diagnose.name import gains, judge_entries
 from mpc_sgft.diagnose.plant import Change, Plant
 from mpc_sgft.diagnose.prepare import NOISE, Setup
 from mpc_sgft.diagnose.screen import Effort
@@ -95,6 +95,18 @@ def test_where_noise_alone_is_left_an_effect_must_gain_more() -> None:
 
     assert not better(0.65, 0.045) and better(0.65, 0.1)
     assert better(0.95, 0.045)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "kind"), [(60.0, 12.0, "unknown"), (60.0, 6.0, "effect"), (6.0, 1.9, "effect")]
+)
+def test_names_that_leave_much_of_an_error_are_no_answer(before: float, after: float, kind: str) -> None:
+    problem, fitted, none = Lines(), np.arange(18), np.zeros(1)
+    setup = Setup(problem, fitted, np.arange(18, 24), fitted // 3, fit(problem, [], [], fitted), none, none)
+    scatter = 0.01 * np.random.default_rng(0).normal(size=24)
+    base = entry(setup, setup.baseline)._replace(errors=np.log1p(before) + scatter)
+    named = entry(setup, fit(problem, [term("a")], [np.ones(1)], fitted))._replace(errors=np.log1p(after) + scatter)
+    assert judge_entries(setup, [base, named], None, np.random.default_rng(0)).kind == kind
 
 
 def test_gravity_may_turn_about_one_axis_or_both() -> None:
