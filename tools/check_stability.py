@@ -1,14 +1,16 @@
 """Random episodes of a task with all its randomisation: how often does the physics fail?
 
-    python -m tools.check_stability [--task push] [--episodes 10000] [--seconds 0] [--seed 0]
+    python -m tools.check_stability [--task push] [--episodes 10000] [--seed 0] [--out results/stability.json]
 
 Half of the environments draw every action anew, the others hold one for several steps: a held command drives the arm to
 the edges of its workspace, a new one shakes it. Ends with exit code 1 if any episode was unstable.
 """
 
 import argparse
+import json
 import sys
 import time
+from pathlib import Path
 
 import torch
 from hydra import compose, initialize_config_module
@@ -45,6 +47,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--episodes", type=int, default=10_000, help="how many (default 10000)")
     parser.add_argument("--seconds", type=float, default=0, help="stop after so long; 0: never")
     parser.add_argument("--seed", type=int, default=0, help="of the first batch")
+    parser.add_argument("--out", type=Path, help="also write the result here, as JSON")
     args = parser.parse_args(argv)
     with initialize_config_module("configs", version_base="1.3"):
         cfg = compose("pretrain", [f"task={args.task}", f"randomize={args.task}"])
@@ -56,6 +59,11 @@ def main(argv: list[str]) -> int:
     took = time.monotonic() - began
     print(f"{args.task}: {episodes} random episodes, {episodes * env.task.episode_steps} control steps in {took:.0f} s")
     print(f"unstable: {unstable}; largest |observation| {far:.3g}, largest speed {fast:.3g} rad/s or m/s")
+    if args.out:
+        steps = episodes * env.task.episode_steps
+        found = {"unstable": unstable, "largest_observation": far, "largest_speed": fast, "seconds": round(took, 1)}
+        result = {"task": args.task, "seed": args.seed, "episodes": episodes, "control_steps": steps} | found
+        args.out.write_text(json.dumps(result, indent=2) + "\n")
     return int(unstable > 0)
 
 

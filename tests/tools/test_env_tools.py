@@ -1,6 +1,7 @@
 """The tools that measure the world run, and say what they found."""
 
 import csv
+import json
 
 import pytest
 
@@ -9,8 +10,9 @@ from tools import benchmark_env, check_stability
 
 def test_stability_counts_episodes(capsys, tmp_path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
-    assert check_stability.main(["--task", "pendulum", "--episodes", "64"]) == 0
-    said = capsys.readouterr().out
+    assert check_stability.main(["--task", "pendulum", "--episodes", "64", "--out", "found.json"]) == 0
+    said, found = capsys.readouterr().out, json.loads((tmp_path / "found.json").read_text())
+    assert (found["episodes"], found["control_steps"], found["unstable"]) == (64, 2560, 0)
     assert "pendulum: 64 random episodes, 2560 control steps" in said and "unstable: 0;" in said
 
 
