@@ -200,6 +200,7 @@ class Agent:
         anchor: float | None = None,
         residual: bool | None = None,
         command_map: bool | None = None,
+        rho: float | None = None,
     ) -> None:
         """Freeze everything but what `method` trains, and start fresh optimisers.
 
@@ -211,6 +212,7 @@ class Agent:
             residual: Train a correction on top of frozen pretrained dynamics; None: as configured.
             command_map: Also learn what the machine makes of a command, a few numbers that hold everywhere; None: as
                 configured.
+            rho: Decay of the dynamics loss per imagined step; None: as configured.
 
         Raises:
             ValueError: If the method is unknown or the horizon is not positive.
@@ -223,6 +225,7 @@ class Agent:
         self.anchor = self.anchor if anchor is None else anchor
         self.residual = self.residual if residual is None else residual
         self.command_map = self.command_map if command_map is None else command_map
+        self.rho = self.rho if rho is None else rho
         self.trainable = (*METHODS[method], "target_q") if method == "tdmpc2" else METHODS[method]
         model = self.model
         model.requires_grad_(False)
@@ -316,7 +319,7 @@ class Agent:
 
     def state_dict(self) -> dict[str, Any]:
         """Everything needed to go on with the same numbers; the torch global generator (dropout) is included."""
-        names = ("method", "horizon", "anchor", "residual", "command_map")
+        names = ("method", "horizon", "anchor", "residual", "command_map", "rho")
         transfer = {name: getattr(self, name) for name in names}
         return {
             "transfer": transfer,

@@ -68,18 +68,19 @@ class Deployment:
         (self.folder / "episodes").mkdir(exist_ok=True)
         build.prepare_process(cfg)
         self.planner = build.make_planner(cfg, env.action_dim)
-        t = cfg.transfer
-        remedies = {"anchor": t.anchor, "residual": t.residual, "command_map": t.command_map}
-        agent.freeze_for_transfer(cfg.method, horizon=cfg.planner.horizon, **remedies)
+        t, sgft = cfg.transfer, cfg.method == "sgft"
+        self.slice_len = t.slice_len if sgft else cfg.train.replay.slice_len
+        ours = {"anchor": t.anchor, "residual": t.residual, "command_map": t.command_map, "rho": t.rho}
+        agent.freeze_for_transfer(cfg.method, horizon=cfg.planner.horizon, **(ours if sgft else {}))
         self.frozen = agent.frozen_hash()
         self.transfer = Transfer(
             agent,
             capacity=(cfg.rollouts + 1) * env.task.episode_steps,
-            slice_len=cfg.train.replay.slice_len,
+            slice_len=self.slice_len,
             batch_size=cfg.train.replay.batch_size,
             seed=cfg.seed,
             updates=t.updates if cfg.method != "zero_shot" else 0,
-            gate=t.gate and cfg.method == "sgft",
+            gate=t.gate and sgft,
             margin=t.gate_margin,
             memory=t.gate_memory,
         )
@@ -135,7 +136,7 @@ class Deployment:
         self.operator.enter("measuring", number)
         metrics = self._measure(rollout, number)
         valid = rollout.steps[~rollout.steps["next", "invalid"][:, 0]]
-        if len(valid) >= self.cfg.train.replay.slice_len and not rollout.intervened:
+        if len(valid) >= self.slice_len and not rollout.intervened:
             self.operator.enter("training", number)
             metrics |= self.transfer.learn(valid, self.operator.track)
         self.state["rollouts"] = number

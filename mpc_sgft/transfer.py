@@ -8,6 +8,7 @@ do.
 """
 
 import copy
+import math
 from collections.abc import Callable, Iterable
 from functools import partial
 from typing import NamedTuple
@@ -37,7 +38,8 @@ class Transfer:
         slice_len, batch_size, seed: Of the replay slices.
         updates: Gradient steps after each rollout.
         gate: Whether fine-tuned parts must first predict unseen rollouts better; without, they act at once.
-        margin: They must lower the error to this share of the pretrained error, over the last `memory` rollouts.
+        margin: They must lower the error to this share of the pretrained error, in the geometric mean over the last
+            `memory` rollouts: one odd rollout shuts nothing.
         memory: Rollouts that the gate looks back on.
     """
 
@@ -73,8 +75,7 @@ class Transfer:
         self.verdicts.append(Verdict(pretrained, fine_tuned, not self.gate))
         recent = self.verdicts[1:][-self.memory :]  # at the first rollout the two are still the same
         if self.gate and recent:
-            lower = sum(v.fine_tuned for v in recent) < self.margin * sum(v.pretrained for v in recent)
-            self.verdicts[-1] = self.verdicts[-1]._replace(accepted=lower)
+            self.verdicts[-1] = self.verdicts[-1]._replace(accepted=clearly_better(recent, self.margin))
         return self.verdicts[-1]
 
     def learn(self, steps: TensorDict, track: Callable[[range], Iterable[int]] = iter) -> dict[str, float]:
@@ -107,6 +108,11 @@ class Transfer:
         self.buffer.load_state_dict(state["buffer"])
         self.acting.load_state_dict(state["acting"])
         self.verdicts = [Verdict(*v) for v in state["verdicts"]]
+
+
+def clearly_better(verdicts: list[Verdict], margin: float) -> bool:
+    """Whether fine-tuning lowered the geometric mean of the errors to less than `margin` of the pretrained one."""
+    return math.prod(v.fine_tuned for v in verdicts) < math.prod(margin * v.pretrained for v in verdicts)
 
 
 @torch.inference_mode()

@@ -8,7 +8,7 @@ from omegaconf import OmegaConf
 from tensordict import TensorDict
 
 from mpc_sgft.agent import Agent
-from mpc_sgft.transfer import Transfer, open_loop_error
+from mpc_sgft.transfer import Transfer, Verdict, clearly_better, open_loop_error
 from mpc_sgft.world_model import WorldModel
 
 SIZES = {"obs_dim": 6, "action_dim": 2, "decode_dim": 3, "latent_dim": 16, "mlp_dim": 32, "enc_dim": 32, "num_q": 2}
@@ -71,6 +71,13 @@ def test_the_gate_closes_again_when_predictions_get_worse():
     t.margin = 0.0  # nothing is good enough any more
     t.learn(rollout(t.pretrained))
     assert same(t.acting, t.pretrained)
+
+
+@pytest.mark.parametrize(("odd", "accepted"), [(3.0, True), (10.0, False)])
+def test_one_odd_rollout_does_not_shut_the_gate(odd, accepted):
+    """0.5^4 * 3 = 0.19 < 0.9^5 = 0.59 < 0.5^4 * 10, although the sums would say 5 > 0.9 * 5."""
+    verdicts = [Verdict(1.0, error, accepted=True) for error in (0.5, 0.5, 0.5, 0.5, odd)]
+    assert clearly_better(verdicts, margin=0.9) is accepted
 
 
 def test_without_the_gate_what_trains_acts_at_once():
