@@ -36,14 +36,21 @@ def prepare_process(cfg: DictConfig) -> None:
     logging.getLogger("torchrl").setLevel(logging.WARNING)  # it announces every buffer it creates
 
 
-def make_env(cfg: DictConfig, num_envs: int, *, randomised: bool = False) -> ControlEnv:
-    """The task in simulation with the effects of `cfg.gap`; with `randomised`, each episode draws its own model.
+def make_env(cfg: DictConfig, num_envs: int, *, randomised: bool = False, learning: bool = False) -> ControlEnv:
+    """The task in simulation with the effects of `cfg.gap`.
+
+    Args:
+        cfg: The run's config.
+        num_envs: Copies stepped side by side [N].
+        randomised: Each episode draws its own model.
+        learning: The episodes are learned from, not measured: they start as `cfg.task.in_training` says.
 
     Raises:
         UserError: For an unknown effect, a parameter out of bounds, or a draw that names nothing.
     """
     with from_config("task"):
-        task = instantiate(cfg.task.env, _convert_="all")
+        differs = cfg.task.get("in_training") or {} if learning else {}
+        task = instantiate({**cfg.task.env, **differs}, _convert_="all")
     noise = {}
     with from_config("gap"):
         present = effects.load(OmegaConf.to_container(cfg.gap.effects, resolve=True))  # type: ignore[arg-type]

@@ -25,7 +25,7 @@ def pretrain(cfg: DictConfig) -> int:
     """Pretrain until the target success is held or the transitions are spent; returns the exit code."""
     folder = run_folder.start(cfg)
     build.prepare_process(cfg)
-    env = build.make_env(cfg, cfg.num_envs, randomised=True)
+    env = build.make_env(cfg, cfg.num_envs, randomised=True, learning=True)
     judge = build.make_env(cfg, cfg.eval_episodes, randomised=True)
     agent = start_agent(cfg, env)
     agent.horizon = cfg.imagined_steps

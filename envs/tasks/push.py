@@ -32,6 +32,9 @@ class Push(AbstractTask):
 
     Success: the puck lies within 2.5 cm of the line when the episode ends, and has not left the table.
 
+    A `stray_share` of the episodes start with the puck anywhere in `stray_x`, past the line too. Where the puck does
+    not glide no other episode ends there, so without them a critic never learns what that costs.
+
     Source: Yin, Westenbroek et al., ICLR 2025, puck pushing.
     """
 
@@ -56,6 +59,8 @@ class Push(AbstractTask):
         puck_mass: float,
         puck_friction: float,
         start_noise: float,
+        stray_share: float = 0.0,
+        stray_x: tuple[float, float] = (0.0, 0.7),
         origin: Sequence[float] = tuple(ORIGIN),
     ):
         if control not in ("cartesian", "joint"):
@@ -66,7 +71,7 @@ class Push(AbstractTask):
         self.episode_steps, self.control_dt, self.sim_dt = episode_steps, control_dt, sim_dt
         self.goal_x, self.tolerance = goal_x, tolerance
         self.puck_x, self.puck_y, self.puck_mass, self.puck_friction = puck_x, puck_y, puck_mass, puck_friction
-        self.start_noise = start_noise
+        self.start_noise, self.stray_share, self.stray_x = start_noise, stray_share, stray_x
         self.origin = np.array(origin, float)
         self._home: Array | None = None
 
@@ -137,7 +142,9 @@ class Push(AbstractTask):
     def start(self, rng: np.random.Generator) -> Start:
         xy = np.array([[-0.07, 0.0]]) + rng.uniform(-self.start_noise, self.start_noise, (1, 2))
         q = kinematics.inverse(self.home(), self._tip_target(xy), REST, TOOL_LENGTH)
-        puck = self.origin + [rng.uniform(*self.puck_x), rng.uniform(*self.puck_y), PUCK_HALF_HEIGHT]
+        strays = self.stray_share > 0 and rng.uniform() < self.stray_share
+        puck_x = self.stray_x if strays else self.puck_x
+        puck = self.origin + [rng.uniform(*puck_x), rng.uniform(*self.puck_y), PUCK_HALF_HEIGHT]
         yaw = rng.uniform(-np.pi, np.pi)
         qpos = np.concatenate([q[0], puck, [np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)]])[None]
         return Start(qpos=qpos, qvel=np.zeros((1, 13)), target=xy if self.control == "cartesian" else q)

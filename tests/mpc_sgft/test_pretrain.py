@@ -1,5 +1,6 @@
 """How pretraining explores, and what it may start from."""
 
+import numpy as np
 import pytest
 import torch
 from omegaconf import OmegaConf
@@ -31,6 +32,17 @@ def test_detours_hold_one_action_in_their_share_of_the_copies():
     assert actions.abs().max() <= 1
     again = explorer(OnlyAModel(), cfg, 0)
     assert torch.equal(again(observation, torch.ones(200, dtype=torch.bool)), actions[0])
+
+
+def test_only_what_pretraining_learns_from_strays_past_the_line() -> None:
+    cfg = compose.compose("pretrain", ["task=push"], [])
+    learned, measured = (build.make_env(cfg, 400, learning=learning).backend for learning in (True, False))
+    for backend in (learned, measured):
+        backend.seed(5)
+    starts = learned.reset(np.arange(400))[:, 2]
+    beyond = cfg.task.in_training.stray_share * (0.7 - 0.575) / 0.7  # of the episodes start past the band
+    assert abs((starts > 0.575).mean() - beyond) < 3 * (beyond / 400) ** 0.5 and starts.max() < 0.7
+    assert measured.reset(np.arange(400))[:, 2].max() <= 0.3
 
 
 def config(**changed):
