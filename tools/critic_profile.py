@@ -20,6 +20,13 @@ from mpc_sgft.rollout import collect, planner_policy
 PUCK_X = [0.1, 0.3, 0.5, 0.55, 0.6, 0.65]  # [m]; the line is at 0.55
 
 
+def lasting_return(reward: torch.Tensor, discount: float) -> torch.Tensor:
+    """Discounted return [N] of rewards [N, T], the last of which goes on for ever."""
+    weight = discount ** torch.arange(reward.shape[1])
+    weight[-1] /= 1 - discount
+    return (weight * reward).sum(1)
+
+
 def row(name: str, checkpoint: str | None, x: float, episodes: int) -> list:
     """One line of the CSV."""
     overrides = ["task=push", "gap=none", f"task.env.puck_x=[{x},{x}]"]
@@ -31,10 +38,7 @@ def row(name: str, checkpoint: str | None, x: float, episodes: int) -> list:
     data = collect(env, planner_policy(model, planner, EVAL_SEED), seed=EVAL_SEED)
     with torch.inference_mode():
         value = model.terminal_value(model.encode(data["observation"][:, 0])).mean()
-    reward, discount = data["next", "reward"][..., 0], cfg.task.discount
-    weight = discount ** torch.arange(reward.shape[1])
-    weight[-1] /= 1 - discount
-    found = (weight * reward).sum(1).mean()
+    found = lasting_return(data["next", "reward"][..., 0], cfg.task.discount).mean()
     return [name, x, episodes, round(float(value), 2), round(float(found), 2)]
 
 
