@@ -56,6 +56,24 @@ def deploy(cfg: DictConfig) -> int:
     return 0
 
 
+def make_transfer(cfg: DictConfig, agent: Agent, episode_steps: int) -> Transfer:
+    """Freeze a pretrained agent as `method` says, and what trains the rest of it."""
+    t, sgft = cfg.transfer, cfg.method == "sgft"
+    ours = {"anchor": t.anchor, "residual": t.residual, "command_map": t.command_map, "rho": t.rho}
+    agent.freeze_for_transfer(cfg.method, horizon=cfg.planner.horizon, **(ours if sgft else {}))
+    return Transfer(
+        agent,
+        capacity=(cfg.rollouts + 1) * episode_steps,
+        slice_len=t.slice_len if sgft else cfg.train.replay.slice_len,
+        batch_size=cfg.train.replay.batch_size,
+        seed=cfg.seed,
+        updates=t.updates if cfg.method != "zero_shot" else 0,
+        gate=t.gate and sgft,
+        margin=t.gate_margin,
+        memory=t.gate_memory,
+    )
+
+
 class Deployment:
     """State of one deployment and its folder. Without a judge, the real rollouts themselves are the measure."""
 
@@ -68,22 +86,8 @@ class Deployment:
         (self.folder / "episodes").mkdir(exist_ok=True)
         build.prepare_process(cfg)
         self.planner = build.make_planner(cfg, env.action_dim)
-        t, sgft = cfg.transfer, cfg.method == "sgft"
-        self.slice_len = t.slice_len if sgft else cfg.train.replay.slice_len
-        ours = {"anchor": t.anchor, "residual": t.residual, "command_map": t.command_map, "rho": t.rho}
-        agent.freeze_for_transfer(cfg.method, horizon=cfg.planner.horizon, **(ours if sgft else {}))
+        self.transfer = make_transfer(cfg, agent, env.task.episode_steps)
         self.frozen = agent.frozen_hash()
-        self.transfer = Transfer(
-            agent,
-            capacity=(cfg.rollouts + 1) * env.task.episode_steps,
-            slice_len=self.slice_len,
-            batch_size=cfg.train.replay.batch_size,
-            seed=cfg.seed,
-            updates=t.updates if cfg.method != "zero_shot" else 0,
-            gate=t.gate and sgft,
-            margin=t.gate_margin,
-            memory=t.gate_memory,
-        )
         self.state: dict[str, Any] = {"rollouts": 0, "aborted": 0, "scores": {}, "seconds": 0.0, "successes": 0}
         self.state |= {"interventions": 0, "rerecorded": 0}
         self.state["outcomes"] = []  # (success, return) of each real rollout
@@ -136,7 +140,7 @@ class Deployment:
         self.operator.enter("measuring", number)
         metrics = self._measure(rollout, number)
         valid = rollout.steps[~rollout.steps["next", "invalid"][:, 0]]
-        if len(valid) >= self.slice_len and not rollout.intervened:
+        if len(valid) >= self.transfer.slice_len and not rollout.intervened:
             self.operator.enter("training", number)
             metrics |= self.transfer.learn(valid, self.operator.track)
         self.state["rollouts"] = number

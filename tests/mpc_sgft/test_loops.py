@@ -11,10 +11,13 @@ from pathlib import Path
 
 import pytest
 import torch
+from omegaconf import OmegaConf
 from safetensors.torch import load_file
 
 from mpc_sgft import checkpoint, deploy
+from mpc_sgft.errors import UserError
 from mpc_sgft.record import read_episode
+from tools import relearn
 
 TINY = ["+experiment=debug", "task=pendulum", "log.tensorboard=false", "log.rerun=false"]
 NEEDED = "task gap method seed real_rollouts aborted_rollouts zero_shot_success final_success rollouts_to_90".split()
@@ -174,3 +177,20 @@ def wait_for(path: Path, process: subprocess.Popen, seconds: float = 120) -> Non
         assert process.poll() is None, f"ended with {process.returncode} before {path.name} appeared"
         assert time.monotonic() < deadline, f"{path} did not appear in {seconds} s"
         time.sleep(0.01)
+
+
+def test_relearning_a_deployment_as_it_was_gives_what_it_learned(deployed):
+    cfg = relearn.config_of(deployed, [], seed=OmegaConf.load(deployed / "config.yaml").seed)
+    learned, success = relearn.relearn(cfg, relearn.rollouts_of(deployed), at=[4])
+    assert success == {4: json.loads((deployed / "summary.json").read_text())["final_success"]}
+    then = load_file(deployed / "checkpoint" / "model.safetensors")
+    now = learned.acting.state_dict()
+    assert then.keys() == now.keys() and all((then[k] == now[k]).all() for k in then)
+
+
+def test_relearning_takes_other_settings_and_refuses_unknown_ones(deployed, pretrained):
+    assert relearn.config_of(deployed, ["transfer.updates=7"], seed=1).transfer.updates == 7
+    with pytest.raises(UserError, match="updats"):
+        relearn.config_of(deployed, ["transfer.updats=7"], seed=1)
+    with pytest.raises(UserError, match="no deployment"):
+        relearn.config_of(pretrained, [], seed=1)
