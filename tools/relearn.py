@@ -33,7 +33,7 @@ def config_of(run: Path, settings: list[str], seed: int) -> DictConfig:
     """The config of a finished run with some values changed.
 
     Raises:
-        UserError: If the folder is no deployment's, or a setting is unknown.
+        UserError: If the folder is no simulated deployment's, or a setting is unknown.
     """
     path = run / "config.yaml"
     if not path.is_file():
@@ -47,6 +47,10 @@ def config_of(run: Path, settings: list[str], seed: int) -> DictConfig:
         cfg.merge_with_dotlist([*settings, f"seed={seed}"])
     except OmegaConfBaseException as err:
         raise UserError(f"--set {' '.join(settings)}: {err.args[0].splitlines()[0]}") from err
+    if cfg.backend.name != "sim":
+        raise UserError(
+            f"{run} was driven with --backend {cfg.backend.name}: only a simulated gap can be evaluated in."
+        )
     return cfg
 
 
@@ -67,7 +71,8 @@ def relearn(cfg: DictConfig, rollouts: list[TensorDict], at: list[int]) -> tuple
     success = {}
     bar = progress(len(rollouts), initial=0, desc="relearn", unit="rollout", disable=False)
     for count, steps in enumerate(rollouts, 1):
-        transfer.learn(steps)
+        if len(steps) >= transfer.slice_len:
+            transfer.learn(steps)
         bar.update(1)
         if count in at:
             result = score(collect(judge, planner_policy(transfer.acting, planner, EVAL_SEED), seed=EVAL_SEED))

@@ -194,3 +194,5 @@ def test_relearning_takes_other_settings_and_refuses_unknown_ones(deployed, pret
         relearn.config_of(deployed, ["transfer.updats=7"], seed=1)
     with pytest.raises(UserError, match="no deployment"):
         relearn.config_of(pretrained, [], seed=1)
+    with pytest.raises(UserError, match="simulated gap"):
+        relearn.config_of(deployed, ["backend.name=franka"], seed=1)
