@@ -115,26 +115,35 @@ def _even(
     """One piece on an even clock: positions by cubic interpolation.
 
     Stamps that scatter around an even clock by less than half a sample are taken for scattered readings of a controller
-    that ticks evenly: the command of a row acts from its tick on. Otherwise commands act from the row's own time on.
+    that ticks evenly: the command of a row acts from its tick on, and a force that was read before shows the command
+    before. Otherwise commands act from the row's own time on, and nobody knows which of two a force shows.
     """
     time = columns["time"][rows]
     ticks = np.concatenate([[0], np.cumsum(np.maximum(1, np.round(np.diff(time) / dt)))])
     even_dt, first = _line(ticks, time)
-    if np.abs(time - first - even_dt * ticks).max() < 0.5 * even_dt:
+    ticking = bool(np.abs(time - first - even_dt * ticks).max() < 0.5 * even_dt)
+    if ticking:
         even, late = first + even_dt * np.arange(int(ticks[-1]) + 1), even_dt / 2
     else:
         even_dt, late = dt, 1e-9
         even = time[0] + dt * np.arange(int((time[-1] - time[0]) / dt + 1e-6) + 1)
     jitter = len(even) != len(time) or bool(np.abs(time - even).max() > JITTER * dt)
     held = np.clip(np.searchsorted(time, even + late, side="right") - 1, 0, len(time) - 1)
+    off = time[held] - even
+    early = np.where(off < -JITTER * dt, 1.0, 0.0) if ticking else np.full(len(even), 0.5)
+    own = np.abs(off) < late  # ticks with a row of their own
+    early[~own] = 0.5
 
-    def smooth(values: Array) -> Array:
+    def smooth(name: str) -> Array:
+        values = columns[name][rows]
+        if jitter and ticking and name.startswith("force/"):  # it jumps with its command
+            return np.interp(even, even[own], values[held[own]])
         return CubicSpline(time, values)(even) if jitter else values
 
     ctrl = np.stack([columns[f"ctrl/{a}"][rows][held] for a in actuators], 1) if actuators else np.zeros((len(even), 0))
     wanted = [n for n in columns if n.split("/")[0] in KINDS]
     wanted = [n for n in wanted if not n.startswith("qpos/") or n.split("/", 1)[1] in joints]
-    return Episode(name, even_dt, ctrl, {n: smooth(columns[n][rows]) for n in wanted}, notes, jitter)
+    return Episode(name, even_dt, ctrl, {n: smooth(n) for n in wanted}, notes, early if jitter else 0.0)
 
 
 def _line(x: Array, y: Array) -> tuple[float, float]:

@@ -167,8 +167,7 @@ def discrepancy(
     By the simulator's time step: what steps a quarter as long change is taken off; what is left of a second-order error
     is less than the last halving changed, and as much of a first-order one, which dry friction makes where a motion
     reverses. What is off once in a window is taken to stay off. By the clock: a force follows its command at once, and
-    may have been read before or after that changed; always the one, or, where stamps scattered, now the one and now the
-    other.
+    may always have been read before that changed, not after; where nobody knows, now the one and now the other.
     """
     w, change = replayer.windows, change_of(terms, values)
 
@@ -180,10 +179,9 @@ def discrepancy(
 
     predicted, half, quarter = replayer.simulate([change])[0], simulate(2), simulate(4)
     step = np.maximum.accumulate(np.abs(quarter - half), 1)
-    clock = predicted - replayer.read_early().simulate([change])[0]
-    loose = np.array([episodes[i].scattered for i in w.episode])[:, None, None]
-    floor = np.stack([step, np.where(loose, 0.0, clock)])
-    return Discrepancy(quarter - predicted, floor, np.where(loose, np.abs(clock) / 2, 0.0))
+    clock = replayer.read(early=0.0).simulate([change])[0] - replayer.read(early=1.0).simulate([change])[0]
+    unsure = np.sqrt(w.early * (1 - w.early))[..., None]  # standard deviation of before or after
+    return Discrepancy(quarter - predicted, np.stack([step, np.where(unsure > 0, 0.0, clock)]), np.abs(clock) * unsure)
 
 
 def _problem(

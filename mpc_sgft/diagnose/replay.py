@@ -41,6 +41,7 @@ class Windows(NamedTuple):
         samples: n, predicted samples after the start.
         measured: Signals at these samples, [W, n, S].
         q0, v0, a0: Measured start of each joint, [W, nj].
+        early: Chance that the force of a sample was read before its command was there, [W, n].
     """
 
     episode: Index
@@ -50,6 +51,7 @@ class Windows(NamedTuple):
     q0: Array
     v0: Array
     a0: Array
+    early: Array
 
 
 class Replayer:
@@ -72,7 +74,6 @@ class Replayer:
         self.windows = self._cut(max(2, round(window / self.dt)))
         self._nominal_ctrl: Array | None = None
         self.simulations = 0
-        self.early = False
 
     def simulate(
         self,
@@ -111,10 +112,10 @@ class Replayer:
         other._nominal_ctrl = None
         return other
 
-    def read_early(self) -> Replayer:
-        """The same windows with forces that are read just before a sample's command, not just after."""
+    def read(self, early: float) -> Replayer:
+        """The same windows with all forces read just before a sample's command (1), or just after (0)."""
         other = copy.copy(self)
-        other.early = True
+        other.windows = self.windows._replace(early=np.full_like(self.windows.early, early))
         return other
 
     @property
@@ -179,7 +180,7 @@ class Replayer:
         qpos = np.concatenate([state[:, :, None, 1 + qadr], states[..., 1 + qadr].reshape(*shape, nj)], 2)
         qvel = np.concatenate([state[:, :, None, 1 + m.nq + vadr], states[..., 1 + m.nq + vadr].reshape(*shape, nj)], 2)
         late = np.array([[c.late.get(joint, 0.0) for joint in self.plant.joints] for c in changes])
-        out = self._read(qpos, qvel, sensed.reshape(*shape, -1), m, late, a)
+        out = self._read(qpos, qvel, sensed.reshape(*shape, -1), m, late, a, w.early[pick])
         for k, change in enumerate(changes if any(c.reads for c in changes) else []):
             for i, name in enumerate(self.signals):
                 out[k, ..., i] = change.read(out[k, ..., i], name)
@@ -195,7 +196,9 @@ class Replayer:
                 out[row, mine] = np.interp(at, np.arange(len(values)), values[:, joint])
         return out
 
-    def _read(self, qpos: Array, qvel: Array, sensed: Array, m: mujoco.MjModel, late: Array, a: Array) -> Array:
+    def _read(
+        self, qpos: Array, qvel: Array, sensed: Array, m: mujoco.MjModel, late: Array, a: Array, early: Array
+    ) -> Array:
         """Signals at the samples' times from states at the steps' times, [K, W, n, S].
 
         Args:
@@ -204,6 +207,7 @@ class Replayer:
             m: Model that the sensors are of.
             late: Seconds by which readings are old, [K, nj].
             a: Acceleration before the start, [K, W, nj].
+            early: Of the windows, [W, n].
         """
         times = self.dt * np.arange(1, self.windows.samples + 1)[None]
         late = late if late.any() else late[:1]
@@ -220,19 +224,22 @@ class Replayer:
                 columns.append(_at(qvel[..., i], (times + self.half - late[:, i, None]) / self.h))
             elif kind == "force":
                 felt = m.actuator(part).gear[0] * sensed[..., int(m.sensor(f"{FORCE}{part}").adr[0])]
-                columns.append(self._force(felt, times / self.h))
+                value = self._force(felt, times / self.h, 1.0 if self.half else 0.0)
+                if early.any():
+                    value = value + early * (self._force(felt, times / self.h, -1.0) - value)
+                columns.append(value)
             else:
                 columns.append(_at(sensed[..., int(m.sensor(part).adr[0])], times / self.h))
         return np.stack(columns, -1)
 
-    def _force(self, felt: Array, at: NDArray[Any]) -> Array:
-        """Force of an actuator on its joint at the samples, of the command from there on, or until there if `early`.
+    def _force(self, felt: Array, at: NDArray[Any], away: float) -> Array:
+        """Force of an actuator on its joint at the samples.
 
         Args:
             felt: At each physics step, [K, W, N].
             at: Steps of the samples, [1, n].
+            away: Step that it is read from: after the sample, under the command from there on, or before it.
         """
-        away = -1.0 if self.early else 1.0 if self.half else 0.0
         value = _at(felt, at + away)
         if away and self.dt > 3 * self.h:  # back to the sample's own state, under that command
             value = 2 * value - _at(felt, at + 2 * away)
@@ -270,6 +277,7 @@ class Replayer:
         def at_start(what: str) -> Array:
             return np.array([getattr(self.smooth[i], what)[s] for i, s in zip(episode, start, strict=True)])
 
+        early = [np.broadcast_to(self.episodes[i].early, len(self.episodes[i].ctrl))[r] for i, r in rows]
         return Windows(
             np.array(episode),
             np.array(start),
@@ -278,6 +286,7 @@ class Replayer:
             at_start("q"),
             at_start("v"),
             at_start("a"),
+            np.array(early),
         )
 
 

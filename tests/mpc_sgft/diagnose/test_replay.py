@@ -113,25 +113,38 @@ def test_the_force_of_a_stiff_servo_is_that_of_the_sample_under_its_new_command(
     error = replayer.simulate([Change()])[0] - w.measured
     assert np.median(np.abs(error)) < 0.02 * size  # what is left comes from the starts; a step late: 0.04
     before = np.array([early[s + 1 : s + 1 + w.samples] for s in w.start])[..., None]
-    error = replayer.read_early().simulate([Change()])[0] - before
+    error = replayer.read(early=1.0).simulate([Change()])[0] - before
     assert np.median(np.abs(error)) < 0.02 * size < np.median(np.abs(before - w.measured))
 
 
-@pytest.mark.parametrize("scattered", [False, True])
-def test_a_force_may_have_been_read_before_its_command(servo, scattered: bool) -> None:
+def test_forces_are_compared_on_the_side_of_their_command_where_they_were_read(servo) -> None:
+    plant, episode, early = servo
+    first = np.random.default_rng(0).random(len(early)) < 0.3
+    force = np.where(first, early, episode.signals["force/servo"])
+    mixed = replace(episode, signals={**episode.signals, "force/servo": force}, early=first.astype(float))
+    replayer = Replayer(plant, [mixed], 0.4, ["force/servo"])
+    size = np.abs(force).max()
+    error = np.abs(replayer.simulate([Change()])[0] - replayer.windows.measured)
+    assert np.median(error) < 0.02 * size and np.quantile(error, 0.9) < 0.04 * size
+    wrong = np.abs(replayer.read(early=0.0).simulate([Change()])[0] - replayer.windows.measured)
+    assert np.quantile(wrong, 0.9) > 0.08 * size
+
+
+@pytest.mark.parametrize("unsure", [False, True])
+def test_a_force_may_have_been_read_before_its_command(servo, unsure: bool) -> None:
     plant, episode, _ = servo
-    episode = replace(episode, scattered=scattered)
+    episode = replace(episode, early=0.5 * unsure)
     replayer = Replayer(plant, [episode], 0.4, ["qpos/x", "force/servo"])
     _, floor, doubt = discrepancy(plant, [episode], replayer, [], [])
     w, jump = replayer.windows, 4000.0 * np.diff(episode.ctrl[:, 0], prepend=0.0)
     jumps = np.array([jump[s + 1 : s + 1 + w.samples] for s in w.start])
-    often, always = (np.abs(jumps) / 2, 0 * jumps) if scattered else (0 * jumps, jumps)
+    often, always = (np.abs(jumps) / 2, 0 * jumps) if unsure else (0 * jumps, jumps)
     near = 0.05 * np.abs(jumps).max()
     np.testing.assert_allclose(doubt[..., 1], often, atol=near)
     np.testing.assert_allclose(floor[1, ..., 1], always, atol=near)
     assert not doubt[..., 0].any() and not floor[1, ..., 0].any()
     problem = prepare(plant, [episode], [], window=0.3, signals=None, held_out=None).problem
-    assert (np.median(problem.scale[..., 1]) > 0.3 * np.median(np.abs(jumps))) == scattered
+    assert (np.median(problem.scale[..., 1]) > 0.3 * np.median(np.abs(jumps))) == unsure
 
 
 @pytest.mark.parametrize("sharp", [False, True])
