@@ -27,7 +27,7 @@ def main() -> None:
     parser.add_argument("--task", default="push")
     parser.add_argument("--set", nargs="*", default=[], metavar="name=value", help="overrides of every run")
     parser.add_argument("--runs", type=Path, default=Path("runs/pretrain"))
-    parser.add_argument("--jobs", type=int, default=2, help="runs side by side")
+    parser.add_argument("--jobs", type=int, default=1, help="runs side by side; more are slower each")
     args = parser.parse_args()
 
     def work(seed: int) -> dict:
