@@ -130,9 +130,8 @@ def _even(
     jitter = len(even) != len(time) or bool(np.abs(time - even).max() > JITTER * dt)
     held = np.clip(np.searchsorted(time, even + late, side="right") - 1, 0, len(time) - 1)
     off = time[held] - even
-    early = np.where(off < -JITTER * dt, 1.0, 0.0) if ticking else np.full(len(even), 0.5)
     own = np.abs(off) < late  # ticks with a row of their own
-    early[~own] = 0.5
+    off_tick = np.where(own & ticking, np.where(np.abs(off) > JITTER * dt, off, 0.0), np.nan)
 
     def smooth(name: str) -> Array:
         values = columns[name][rows]
@@ -143,7 +142,7 @@ def _even(
     ctrl = np.stack([columns[f"ctrl/{a}"][rows][held] for a in actuators], 1) if actuators else np.zeros((len(even), 0))
     wanted = [n for n in columns if n.split("/")[0] in KINDS]
     wanted = [n for n in wanted if not n.startswith("qpos/") or n.split("/", 1)[1] in joints]
-    return Episode(name, even_dt, ctrl, {n: smooth(n) for n in wanted}, notes, early if jitter else 0.0)
+    return Episode(name, even_dt, ctrl, {n: smooth(n) for n in wanted}, notes, off_tick if jitter else 0.0)
 
 
 def _line(x: Array, y: Array) -> tuple[float, float]:

@@ -13,7 +13,7 @@ from mpc_sgft.diagnose.fit import Discrepancy, Fit, Problem, Residuals, by_parts
 from mpc_sgft.diagnose.library import Term
 from mpc_sgft.diagnose.plant import Plant, joint_of
 from mpc_sgft.diagnose.record import Array, Episode, Index
-from mpc_sgft.diagnose.replay import Replayer
+from mpc_sgft.diagnose.replay import AFTER, BEFORE, EITHER, Replayer
 from mpc_sgft.diagnose.smooth import noise_of, smooth
 from mpc_sgft.diagnose.table import Scales
 from mpc_sgft.errors import UserError
@@ -179,9 +179,10 @@ def discrepancy(
 
     predicted, half, quarter = replayer.simulate([change])[0], simulate(2), simulate(4)
     step = np.maximum.accumulate(np.abs(quarter - half), 1)
-    clock = replayer.read(early=0.0).simulate([change])[0] - replayer.read(early=1.0).simulate([change])[0]
-    unsure = np.sqrt(w.early * (1 - w.early))[..., None]  # standard deviation of before or after
-    return Discrepancy(quarter - predicted, np.stack([step, np.where(unsure > 0, 0.0, clock)]), np.abs(clock) * unsure)
+    clock = replayer.read(AFTER).simulate([change])[0] - replayer.read(BEFORE).simulate([change])[0]
+    unsure = (w.acting == EITHER).all(-1)[..., None]
+    floor = np.stack([step, np.where(unsure, 0.0, clock)])
+    return Discrepancy(quarter - predicted, floor, np.where(unsure, np.abs(clock) / 2, 0.0))
 
 
 def _problem(

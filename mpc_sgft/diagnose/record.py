@@ -43,7 +43,7 @@ class Episode:
         ctrl: Commands in the model's order, [T, nu].
         signals: `qpos/…`, `qvel/…`, `force/…`, `sensor/…` -> [T].
         notes: What was noticed while reading, in words.
-        early: Chance that a sample's force was read before its command was there, 0, 1 or between, [T] or a number.
+        off_tick: Seconds after its tick at which each sample was read, negative before, [T] or a number; nan: unknown.
     """
 
     name: str
@@ -51,7 +51,7 @@ class Episode:
     ctrl: Array
     signals: dict[str, Array]
     notes: tuple[str, ...] = field(default=())
-    early: Array | float = 0.0
+    off_tick: Array | float = 0.0
 
     @property
     def seconds(self) -> float:

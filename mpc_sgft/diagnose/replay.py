@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from envs.effects import place_rotors
-from mpc_sgft.diagnose.plant import FORCE, Change, Plant
+from mpc_sgft.diagnose.plant import Change, Plant
 from mpc_sgft.diagnose.record import Array, Episode, Index
-from mpc_sgft.diagnose.rub import rub
+from mpc_sgft.diagnose.rub import Drive, rub
 from mpc_sgft.diagnose.smooth import smooth
 
 FULL = mujoco.mjtState.mjSTATE_FULLPHYSICS
@@ -29,6 +29,8 @@ CTRL = int(mujoco.mjtState.mjSTATE_CTRL)
 FORCED = CTRL | int(mujoco.mjtState.mjSTATE_QFRC_APPLIED)
 THREADS = int(os.environ.get("OMP_NUM_THREADS", len(os.sched_getaffinity(0))))
 MIN_LAG = 1e-5  # [s] faster than this is no lag
+MOMENT = 1e-5  # [s]
+BEFORE, AFTER, EITHER = (-MOMENT, 0.0), (0.0, MOMENT), (-MOMENT, MOMENT)
 EXPLODED = 1e6  # predictions are clipped here, so that an unstable candidate is bad, not infinite
 
 
@@ -41,7 +43,7 @@ class Windows(NamedTuple):
         samples: n, predicted samples after the start.
         measured: Signals at these samples, [W, n, S].
         q0, v0, a0: Measured start of each joint, [W, nj].
-        early: Chance that the force of a sample was read before its command was there, [W, n].
+        acting: From when to when after its tick the command acts whose force a sample shows [s], [W, n, 2].
     """
 
     episode: Index
@@ -51,7 +53,7 @@ class Windows(NamedTuple):
     q0: Array
     v0: Array
     a0: Array
-    early: Array
+    acting: Array
 
 
 class Replayer:
@@ -112,10 +114,10 @@ class Replayer:
         other._nominal_ctrl = None
         return other
 
-    def read(self, early: float) -> Replayer:
-        """The same windows with all forces read just before a sample's command (1), or just after (0)."""
+    def read(self, acting: tuple[float, float]) -> Replayer:
+        """The same windows with all forces read BEFORE or AFTER a sample's command is there."""
         other = copy.copy(self)
-        other.windows = self.windows._replace(early=np.full_like(self.windows.early, early))
+        other.windows = self.windows._replace(acting=np.broadcast_to(acting, self.windows.acting.shape))
         return other
 
     @property
@@ -159,7 +161,7 @@ class Replayer:
         inputs = np.zeros((len(models), count, self.steps, m.nu + (m.nv if force is not None else 0)))
         order = [m.actuator(a).id for a in self.plant.actuators] if extra else list(range(nu))
         for k, change in enumerate(changes):
-            inputs[k, :, :, order] = np.moveaxis(self._ctrl(change)[pick], -1, 0)
+            inputs[k, :, :, order] = np.moveaxis(self._ctrl(change, pick), -1, 0)
         if force is not None:
             inputs[..., m.nu + vadr] = force
         if m.na:
@@ -180,7 +182,8 @@ class Replayer:
         qpos = np.concatenate([state[:, :, None, 1 + qadr], states[..., 1 + qadr].reshape(*shape, nj)], 2)
         qvel = np.concatenate([state[:, :, None, 1 + m.nq + vadr], states[..., 1 + m.nq + vadr].reshape(*shape, nj)], 2)
         late = np.array([[c.late.get(joint, 0.0) for joint in self.plant.joints] for c in changes])
-        out = self._read(qpos, qvel, sensed.reshape(*shape, -1), m, late, a, w.early[pick])
+        felt = self._felt(models, changes, pick, sensed.reshape(*shape, -1), inputs)
+        out = self._read(qpos, qvel, sensed.reshape(*shape, -1), felt, m, late, a)
         for k, change in enumerate(changes if any(c.reads for c in changes) else []):
             for i, name in enumerate(self.signals):
                 out[k, ..., i] = change.read(out[k, ..., i], name)
@@ -196,18 +199,51 @@ class Replayer:
                 out[row, mine] = np.interp(at, np.arange(len(values)), values[:, joint])
         return out
 
+    def _felt(
+        self, models: list[mujoco.MjModel], changes: list[Change], pick: Index, sensed: Array, inputs: Array
+    ) -> dict[str, Array]:
+        """Compared force signals -> what they read at the samples, [K, W, n].
+
+        A step's force is that of its state under the mean of its commands; a reading shows the command that acts then.
+
+        Args:
+            sensed: Sensors, [K, W, N, …].
+            inputs: Of each step, [K, W, N, …].
+        """
+        names = [name for name in self.signals if name.startswith("force/")]
+        if not names:
+            return {}
+        w, at = self.windows, self.dt * np.arange(1, self.windows.samples + 1)[None] / self.h
+        ticks = self.dt * (w.start[pick, None] + np.arange(1, w.samples + 1))[..., None]
+        now = np.stack([self._held(c, pick, ticks + w.acting[pick]) for c in changes])  # [K, W, n, nu]
+        out = {}
+        for name in names:
+            part = name.split("/", 1)[1]
+            drives = [Drive.of(m, part, 0) for m in models]
+            felt, then = _at(sensed[..., drives[0].sensor], at), _at(inputs[..., drives[0].ctrl], at)
+            u = now[..., self.plant.actuators.index(part)]
+            out[name] = np.stack([d.load(*rows) for d, *rows in zip(drives, felt, then, u, strict=True)])
+        return out
+
     def _read(
-        self, qpos: Array, qvel: Array, sensed: Array, m: mujoco.MjModel, late: Array, a: Array, early: Array
+        self,
+        qpos: Array,
+        qvel: Array,
+        sensed: Array,
+        felt: dict[str, Array],
+        m: mujoco.MjModel,
+        late: Array,
+        a: Array,
     ) -> Array:
         """Signals at the samples' times from states at the steps' times, [K, W, n, S].
 
         Args:
             qpos, qvel: States, [K, W, N + 1, nj].
             sensed: Sensors, [K, W, N, …].
+            felt: Force signals.
             m: Model that the sensors are of.
             late: Seconds by which readings are old, [K, nj].
             a: Acceleration before the start, [K, W, nj].
-            early: Of the windows, [W, n].
         """
         times = self.dt * np.arange(1, self.windows.samples + 1)[None]
         late = late if late.any() else late[:1]
@@ -223,46 +259,38 @@ class Replayer:
                 i = self.plant.joints.index(part)
                 columns.append(_at(qvel[..., i], (times + self.half - late[:, i, None]) / self.h))
             elif kind == "force":
-                felt = m.actuator(part).gear[0] * sensed[..., int(m.sensor(f"{FORCE}{part}").adr[0])]
-                value = self._force(felt, times / self.h, 1.0 if self.half else 0.0)
-                if early.any():
-                    value = value + early * (self._force(felt, times / self.h, -1.0) - value)
-                columns.append(value)
+                columns.append(felt[name])
             else:
                 columns.append(_at(sensed[..., int(m.sensor(part).adr[0])], times / self.h))
         return np.stack(columns, -1)
 
-    def _force(self, felt: Array, at: NDArray[Any], away: float) -> Array:
-        """Force of an actuator on its joint at the samples.
+    def _ctrl(self, change: Change, pick: Index) -> Array:
+        """Mean command of each physics step of the picked windows, [W, N, nu]."""
+        plain = not change.commands and not np.any(change.delay) and not np.any(change.lag)
+        if plain and self._nominal_ctrl is not None:
+            return self._nominal_ctrl[pick]
+        every = np.arange(len(self.windows.start), dtype=np.int_) if plain else pick
+        edges = self.step_times()[every][:, :, None] + np.array([-self.half, self.h - self.half])
+        out = self._held(change, every, edges)
+        if plain:
+            self._nominal_ctrl = out
+            return out[pick]
+        return out
 
-        Args:
-            felt: At each physics step, [K, W, N].
-            at: Steps of the samples, [1, n].
-            away: Step that it is read from: after the sample, under the command from there on, or before it.
-        """
-        value = _at(felt, at + away)
-        if away and self.dt > 3 * self.h:  # back to the sample's own state, under that command
-            value = 2 * value - _at(felt, at + 2 * away)
-        return value
-
-    def _ctrl(self, change: Change) -> Array:
-        """Mean command of each physics step of each window, [W, N, nu]."""
+    def _held(self, change: Change, pick: Index, edges: Array) -> Array:
+        """Mean commands of the picked windows over intervals of time since their episode's start, [W, N, 2 -> nu]."""
         size = len(self.plant.actuators)
         late, lag = (np.broadcast_to(np.asarray(x, float), (size,)) for x in (change.delay, change.lag))
-        plain = not change.commands and not late.any() and not lag.any()
-        if plain and self._nominal_ctrl is not None:
-            return self._nominal_ctrl
-        out = np.empty((len(self.windows.start), self.steps, size))
-        edges = self.step_times()[:, :, None] + np.array([-self.half, self.h - self.half])
+        out = np.empty((*edges.shape[:2], size))
         for i, episode in enumerate(self.episodes):
+            mine = np.flatnonzero(self.windows.episode[pick] == i)
+            if not len(mine):
+                continue
             ctrl = episode.ctrl
             for command in change.commands:
                 ctrl = command(ctrl, episode.dt)
-            mine = np.flatnonzero(self.windows.episode == i)
             for a in range(size):
                 out[mine, :, a] = held_mean(ctrl[:, a], episode.dt, edges[mine] - late[a], lag[a])
-        if plain:
-            self._nominal_ctrl = out
         return out
 
     def _cut(self, n: int) -> Windows:
@@ -277,7 +305,8 @@ class Replayer:
         def at_start(what: str) -> Array:
             return np.array([getattr(self.smooth[i], what)[s] for i, s in zip(episode, start, strict=True)])
 
-        early = [np.broadcast_to(self.episodes[i].early, len(self.episodes[i].ctrl))[r] for i, r in rows]
+        off = np.array([np.broadcast_to(self.episodes[i].off_tick, len(self.episodes[i].ctrl))[r] for i, r in rows])
+        known = np.isfinite(off)[..., None]
         return Windows(
             np.array(episode),
             np.array(start),
@@ -286,7 +315,7 @@ class Replayer:
             at_start("q"),
             at_start("v"),
             at_start("a"),
-            np.array(early),
+            np.where(known, np.nan_to_num(off)[..., None] + AFTER, EITHER),
         )
 
 

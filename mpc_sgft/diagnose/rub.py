@@ -20,7 +20,7 @@ class Drive(NamedTuple):
         joint: Index of its joint.
         sensor, ctrl: Where its force and its command are.
         gear, gain: Force of the joint per force of the actuator, and that per command.
-        low, high: Limits of the actuator's force.
+        force, command: Lowest and highest of either.
     """
 
     joint: int
@@ -28,22 +28,31 @@ class Drive(NamedTuple):
     ctrl: int
     gear: float
     gain: float
-    low: float
-    high: float
+    force: tuple[float, float]
+    command: tuple[float, float]
 
     @classmethod
     def of(cls, m: mujoco.MjModel, name: str, joint: int) -> Drive:
         a = m.actuator(name)
-        limits = m.actuator_forcerange[a.id] if m.actuator_forcelimited[a.id] else (-np.inf, np.inf)
+        force = _limits(m.actuator_forcelimited[a.id], m.actuator_forcerange[a.id])
+        command = _limits(m.actuator_ctrllimited[a.id], m.actuator_ctrlrange[a.id])
         direct = m.actuator_dyntype[a.id] == mujoco.mjtDyn.mjDYN_NONE
         gain = float(a.gainprm[0]) if direct and m.actuator_gaintype[a.id] == mujoco.mjtGain.mjGAIN_FIXED else 0.0
         at = int(m.sensor(f"{FORCE}{name}").adr[0])
-        return cls(joint, at, int(a.id), float(a.gear[0]), gain, float(limits[0]), float(limits[1]))
+        return cls(joint, at, int(a.id), float(a.gear[0]), gain, force, command)
 
     def load(self, felt: Array, then: Array, now: Array) -> Array:
-        """Force on the joint under the commands `now`, from sensors read under the commands `then`, [R]."""
-        change = self.gain * (now[:, self.ctrl] - then[:, self.ctrl])
-        return self.gear * np.clip(felt[:, self.sensor] + change, self.low, self.high)
+        """Force on the joint under the command `now`, from what was felt under the command `then`, [...] each.
+
+        What is at its limit stays there.
+        """
+        low, high = self.force
+        change = np.clip(now, *self.command) - np.clip(then, *self.command)
+        return self.gear * np.where((felt <= low) | (felt >= high), felt, np.clip(felt + self.gain * change, low, high))
+
+
+def _limits(limited: int, given: Array) -> tuple[float, float]:
+    return (float(given[0]), float(given[1])) if limited else (-np.inf, np.inf)
 
 
 def rub(
@@ -89,7 +98,7 @@ def rub(
     def set_levels(felt: Array, then: Array, now: Array) -> None:
         load = still.copy()
         for d in drives:
-            load[:, d.joint] += d.load(felt, then, now)
+            load[:, d.joint] += d.load(felt[:, d.sensor], then[:, d.ctrl], now[:, d.ctrl])
         for k, change in enumerate(changes):
             mine = slice(k * each, (k + 1) * each)
             level = before[mine] + sum((f(load[mine]) for f in change.frictions), still[mine])

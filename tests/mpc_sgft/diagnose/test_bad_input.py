@@ -94,12 +94,12 @@ def test_a_force_that_was_read_before_its_tick_shows_the_command_before() -> Non
     force = np.where(late < 0, np.roll(ctrl, 1), ctrl)
     columns = {"time": ticks + late, "ctrl__motor": ctrl, "qpos__x": np.sin(ticks + late), "force__motor": force}
     (episode,) = episodes(_table(**columns), ["motor"], RANGES)
-    np.testing.assert_array_equal(episode.early, late < 0)
+    np.testing.assert_allclose(episode.off_tick, late, atol=2e-6)
     np.testing.assert_array_equal(episode.signals["force/motor"], force)  # not smoothed over the jumps
     gone = np.arange(2000) % 50 != 7
     (holes,) = episodes(_table(**{n: x[gone] for n, x in columns.items()}), ["motor"], RANGES)
-    np.testing.assert_array_equal(holes.early[~gone], 0.5)  # nobody read it there
-    np.testing.assert_array_equal(holes.early[gone], late[gone] < 0)
+    assert np.isnan(holes.off_tick[~gone]).all()  # nobody read it there
+    np.testing.assert_allclose(holes.off_tick[gone], late[gone], atol=2e-6)
 
 
 def test_an_uneven_clock_holds_each_command_from_its_own_time() -> None:
@@ -107,10 +107,10 @@ def test_an_uneven_clock_holds_each_command_from_its_own_time() -> None:
     (episode,) = episodes(_table(time=time, ctrl__motor=np.arange(401.0), qpos__x=np.sin(time)), ["motor"], RANGES)
     held = np.searchsorted(time, time[0] + episode.dt * np.arange(len(episode.ctrl)) + 1e-6, side="right") - 1
     np.testing.assert_array_equal(episode.ctrl[:, 0], held)
-    np.testing.assert_array_equal(episode.early, np.where(np.arange(len(held)) % 5 == 4, 0.5, 0.0))
+    np.testing.assert_array_equal(np.isnan(episode.off_tick), np.arange(len(held)) % 5 == 4)
     time = np.cumsum(np.random.default_rng(0).uniform(0.005, 0.015, 400))
     (episode,) = episodes(_table(time=time, ctrl__motor=np.arange(400.0), qpos__x=np.sin(time)), ["motor"], RANGES)
-    np.testing.assert_array_equal(episode.early, 0.5)
+    assert np.isnan(episode.off_tick).all()
 
 
 def test_files_and_folders(tmp_path: Path) -> None:

@@ -12,7 +12,8 @@ from mpc_sgft.diagnose.library import candidates, enrich, make_term
 from mpc_sgft.diagnose.plant import Change, Plant
 from mpc_sgft.diagnose.prepare import discrepancy, prepare, scales
 from mpc_sgft.diagnose.record import Episode
-from mpc_sgft.diagnose.replay import Replayer, held_mean
+from mpc_sgft.diagnose.replay import AFTER, BEFORE, Replayer, held_mean
+from mpc_sgft.diagnose.rub import Drive
 from mpc_sgft.diagnose.smooth import smooth
 from mpc_sgft.diagnose.table import TABLE, Scales
 from mpc_sgft.errors import UserError
@@ -88,6 +89,23 @@ def test_a_force_is_what_the_joint_feels() -> None:
     np.testing.assert_allclose(replayer.simulate([Change()])[0], 7 * replayer.windows.measured, atol=1e-12)
 
 
+@pytest.mark.parametrize(("delay", "off", "back"), [(0, 0.0, 0), (0.0007, 0.0, 1), (0.0007, 8e-4, 0), (0, -1e-4, 1)])
+def test_a_force_shows_the_command_that_acts_when_it_is_read(delay: float, off: float, back: int) -> None:
+    rng, plant = np.random.default_rng(0), Plant(mujoco.MjSpec.from_string(SLIDE)).sharper()
+    u = rng.normal(size=1000)
+    signals = {"qpos/x": np.zeros(1000), "force/motor": np.roll(u, back)}
+    replayer = Replayer(plant, [Episode("force", 0.002, u[:, None], signals, off_tick=off)], 0.5, ["force/motor"])
+    np.testing.assert_allclose(replayer.simulate([Change(delay=delay)])[0], replayer.windows.measured, atol=1e-6)
+
+
+def test_a_drive_knows_its_limits() -> None:
+    general = '<general name="motor" joint="x" gear="2" gainprm="3" forcerange="-6 6" ctrlrange="-5 5"/>'
+    scene = SLIDE.replace('<motor name="motor" joint="x"/>', general)
+    drive = Drive.of(Plant(mujoco.MjSpec.from_string(scene)).model, "motor", 0)
+    felt, then, now = np.array([[3.0, 1.0, 1.2], [6.0, 2.5, 2.4], [3.0, 1.0, 9.0], [1.5, 6.0, 7.0]]).T
+    np.testing.assert_allclose(drive.load(felt, then, now), [2 * 3.6, 2 * 6.0, 2 * 6.0, 2 * 1.5])
+
+
 @pytest.fixture
 def servo() -> tuple[Plant, Episode, np.ndarray]:
     """A stiff servo's plant and recording, and the force that each sample would show a moment earlier, [T]."""
@@ -113,7 +131,7 @@ def test_the_force_of_a_stiff_servo_is_that_of_the_sample_under_its_new_command(
     error = replayer.simulate([Change()])[0] - w.measured
     assert np.median(np.abs(error)) < 0.02 * size  # what is left comes from the starts; a step late: 0.04
     before = np.array([early[s + 1 : s + 1 + w.samples] for s in w.start])[..., None]
-    error = replayer.read(early=1.0).simulate([Change()])[0] - before
+    error = replayer.read(BEFORE).simulate([Change()])[0] - before
     assert np.median(np.abs(error)) < 0.02 * size < np.median(np.abs(before - w.measured))
 
 
@@ -121,19 +139,19 @@ def test_forces_are_compared_on_the_side_of_their_command_where_they_were_read(s
     plant, episode, early = servo
     first = np.random.default_rng(0).random(len(early)) < 0.3
     force = np.where(first, early, episode.signals["force/servo"])
-    mixed = replace(episode, signals={**episode.signals, "force/servo": force}, early=first.astype(float))
+    mixed = replace(episode, signals={**episode.signals, "force/servo": force}, off_tick=np.where(first, -1e-4, 0.0))
     replayer = Replayer(plant, [mixed], 0.4, ["force/servo"])
     size = np.abs(force).max()
     error = np.abs(replayer.simulate([Change()])[0] - replayer.windows.measured)
     assert np.median(error) < 0.02 * size and np.quantile(error, 0.9) < 0.04 * size
-    wrong = np.abs(replayer.read(early=0.0).simulate([Change()])[0] - replayer.windows.measured)
+    wrong = np.abs(replayer.read(AFTER).simulate([Change()])[0] - replayer.windows.measured)
     assert np.quantile(wrong, 0.9) > 0.08 * size
 
 
 @pytest.mark.parametrize("unsure", [False, True])
 def test_a_force_may_have_been_read_before_its_command(servo, unsure: bool) -> None:
     plant, episode, _ = servo
-    episode = replace(episode, early=0.5 * unsure)
+    episode = replace(episode, off_tick=np.nan if unsure else 0.0)
     replayer = Replayer(plant, [episode], 0.4, ["qpos/x", "force/servo"])
     _, floor, doubt = discrepancy(plant, [episode], replayer, [], [])
     w, jump = replayer.windows, 4000.0 * np.diff(episode.ctrl[:, 0], prepend=0.0)
