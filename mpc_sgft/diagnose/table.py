@@ -73,7 +73,9 @@ TABLE: dict[str, Row] = {
     "actuator_gain": Row({"gain": Par(1.0, lambda s: 1.0, (-0.1, 0.1), -0.95, 2.0)}),
     "actuator_offset": Row({"offset": Par(0.0, lambda s: s.command, (0.05, -0.05))}),
     "deadband": Row({"width": Par(0.0, lambda s: s.command, (0.05, 0.3), 0.0, 3.0)}),
-    "torque_saturation": Row({"limit": Par(lambda s: s.peak, lambda s: s.peak, (-0.15, -0.5), -0.97, 0.0)}),
+    "torque_saturation": Row(
+        {"limit": Par(lambda s: s.peak, lambda s: s.peak, (-0.15, -0.5, -0.75, -0.88), -0.97, 0.0)}
+    ),
     "sensor_offset": Row({"offset": Par(0.0, lambda s: s.travel, (0.1, -0.1), -3.0, 3.0)}),
     "sensor_gain": Row({"gain": Par(1.0, lambda s: 1.0, (-0.05, 0.05), -0.8, 2.0)}),
     "actuator_delay": Row({"delay": Par(0.0, lambda s: 0.02, (0.25, 1.0), 0.0, 15.0, lambda s: s.dt)}),
