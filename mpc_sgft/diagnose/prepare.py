@@ -106,9 +106,24 @@ def prepare(
     base = fit(first, nominal, [t.neutral for t in nominal], fitted)
     missed = replayer.windows.measured - replayer.simulate([change_of(nominal, base.values)])[0]
     noise = np.minimum(noise, [np.median([noise_of(x) for x in missed[..., i]]) for i in range(len(chosen))])
-    own = discrepancy(plant, episodes, replayer, nominal, base.values)
-    problem = _problem(replayer, noise, own, nominal, base.values)
-    base = fit(problem, nominal, base.values, fitted)
+    return _setup(replayer, noise, fitted, held, base, nominal)
+
+
+def around(setup: Setup[Problem], f: Fit) -> Setup[Problem]:
+    """The same windows, with what errors of a start and of the simulator's steps do to a fit, not to the nominal model.
+
+    Where a joint sticks, for one, it no longer matters how fast it was taken to be.
+    """
+    return _setup(setup.problem.replayer, setup.noise, setup.fitted, setup.held, f, setup.baseline.terms)
+
+
+def _setup(
+    replayer: Replayer, noise: Array, fitted: Index, held: Index, near: Fit, nominal: Sequence[Term]
+) -> Setup[Problem]:
+    """A problem that is right near a fit, whose first terms are the nominal ones, and its baseline."""
+    own = discrepancy(replayer.plant, replayer.episodes, replayer, near.terms, near.values)
+    problem = _problem(replayer, noise, own, near.terms, near.values)
+    base = fit(problem, nominal, near.values[: len(nominal)], fitted)
     parts = max(1, -(-UNITS // len(replayer.windows.start)))
     blocks = cut(len(fitted))
     least = by_parts(problem.floor_share[np.concatenate([fitted, held])], parts)  # less says nothing of the machine
@@ -116,9 +131,8 @@ def prepare(
     def judged(errors: Array) -> Array:
         return np.log1p(np.maximum(errors, least))
 
-    return Setup(
-        problem, fitted, held, blocks, base, noise, np.median(own.floor[0], (0, 1)), judged, NOISE + QUIET, parts
-    )
+    floor = np.median(own.floor[0], (0, 1))
+    return Setup(problem, fitted, held, blocks, base, noise, floor, judged, NOISE + QUIET, parts)
 
 
 def cut(fitted: int) -> Index:

@@ -16,6 +16,7 @@ from mpc_sgft.diagnose.screen import Effort, couple, key_of, proposals, screen, 
 from mpc_sgft.diagnose.table import ALIKE
 
 FIRST, NEXT = (1.0, 0.1, 0.01), (0.3,)  # how far from no effect the fits of a first effect start, and of further ones
+REJUDGED = 6  # sets that are judged anew
 SWAPPED = 2  # of the best sets, in which effects are exchanged for those that start well where they end
 
 
@@ -71,6 +72,22 @@ def search(
         if best.error < setup.quiet:
             break
     return list((found | swaps(setup, found, terms, effort)).values())
+
+
+def again(setup: Setup[Any], entries: Sequence[Entry], best: Entry) -> list[Entry]:
+    """The best sets, those that are in them, and the baseline, fitted and judged anew for another setup.
+
+    Args:
+        setup: Of the same data.
+        entries: As from `search`, baseline first.
+        best: One of them.
+    """
+    rivals = sorted((e for e in entries[1:] if e.effects <= best.effects), key=lambda e: e.error)[:REJUDGED]
+    larger = sorted((e for e in entries[1:] if e.effects > best.effects), key=lambda e: e.error)[: REJUDGED // 2]
+    parts = [e for e in entries[1:] if e.key < best.key]
+    kept = {e.key: e for e in [best, *rivals, *parts, *larger]}
+    fits = (fit(setup.problem, e.fit.terms, e.fit.values, setup.fitted) for e in kept.values())
+    return [entry(setup, setup.baseline), *(entry(setup, f) for f in fits)]
 
 
 def swaps(

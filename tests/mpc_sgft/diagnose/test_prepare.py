@@ -1,0 +1,49 @@
+"""Windows are seen as a fit sees them: what friction makes of an error of the start is not what a free slide makes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mpc_sgft.diagnose.check import episodes
+from mpc_sgft.diagnose.entry import Entry, entry
+from mpc_sgft.diagnose.fit import fit
+from mpc_sgft.diagnose.library import make_term
+from mpc_sgft.diagnose.plant import Plant, load_plant
+from mpc_sgft.diagnose.prepare import Problem, Setup, around, prepare, scales
+from mpc_sgft.diagnose.record import read_table
+from mpc_sgft.diagnose.search import again
+
+
+@pytest.fixture
+def dry(slide: Path, record) -> tuple[Plant, Setup[Problem]]:
+    """A slide that sticks for long, recorded with much noise, before anyone knows of friction."""
+    plant = load_plant(slide).sharper()
+    table = read_table(record(seconds=8.0, coulomb=15.0, noise=5e-4))
+    recorded = episodes(table, plant.actuators, plant.ranges())
+    return plant, prepare(plant, recorded, [], window=None, signals=None, held_out=None)
+
+
+def _fit(setup: Setup[Problem], plant: Plant, *sizes: tuple[str, float]) -> Entry:
+    terms = [make_term(plant, name, "x", scales(plant, setup.problem.replayer)["joint", "x"]) for name, _ in sizes]
+    return entry(setup, fit(setup.problem, terms, [np.array([x]) for _, x in sizes], setup.fitted))
+
+
+def test_near_the_right_fit_noise_alone_is_left(dry) -> None:
+    plant, setup = dry
+    far = _fit(setup, plant, ("coulomb_friction", 15.0))
+    near = _fit(around(setup, far.fit), plant, ("coulomb_friction", 15.0))
+    squares = [float((e.fit.r**2).mean()) for e in (far, near)]
+    assert 0.8 < squares[1] < 1.15 < 1.8 < squares[0], squares
+
+
+def test_judging_again_keeps_the_best_sets_and_their_parts(dry) -> None:
+    plant, setup = dry
+    singles = [_fit(setup, plant, (n, 0.1)) for n in ("coulomb_friction", "viscous_friction", "quadratic_drag")]
+    pair = _fit(setup, plant, ("viscous_friction", 0.1), ("coulomb_friction", 15.0))
+    found = [entry(setup, setup.baseline), *singles, pair]
+    judged = again(around(setup, pair.fit), found, pair)
+    assert not judged[0].effects and len({e.key for e in judged}) == len(judged)
+    assert {pair.key, *(e.key for e in singles if e.key < pair.key)} <= {e.key for e in judged}
