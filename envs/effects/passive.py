@@ -6,6 +6,7 @@ that is piecewise linear in the speed. MuJoCo's implicit integrators know the sl
 """
 
 import mujoco
+import numpy as np
 
 from envs.effects.base import pick
 
@@ -81,9 +82,13 @@ def stiffen_dry_friction(joint: mujoco.MjsJoint) -> None:
 
 
 def effective_inertia(spec: mujoco.MjSpec, joints: list[mujoco.MjsJoint]) -> list[float]:
-    """Inertia that a force at each joint has to move in the scene's initial posture, kg or kg m^2."""
+    """Inertia that a force at each joint has to move in the scene's initial posture, armatures and all, kg or kg m^2."""
     model = spec.copy().compile()
-    return [float(1 / model.dof_invweight0[model.joint(j.name).dofadr[0]]) for j in joints]
+    data, whole = mujoco.MjData(model), np.zeros((model.nv, model.nv))
+    mujoco.mj_forward(model, data)
+    mujoco.mj_fullM(model, data, whole)  # dof_invweight0 leaves armatures out
+    inverse = np.linalg.inv(whole)
+    return [float(1 / inverse[i, i]) for i in (int(model.joint(j.name).dofadr[0]) for j in joints)]
 
 
 def require_linear(actuator: mujoco.MjsActuator, effect: str, constant_gain: bool = False) -> None:

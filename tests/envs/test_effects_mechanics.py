@@ -118,6 +118,8 @@ def test_a_joint_that_nothing_drives_has_no_play(build) -> None:
     assert build(scene, {"backlash": {"gap": 0.1}}).nq == 3
     with pytest.raises(ValueError, match="no actuator drives the joint 'idle'"):
         build(scene, {"backlash": {"gap": 0.1, "at": ["idle"]}})
+    heavy = PLAIN.replace('type="slide"', 'type="slide" armature="50"')  # a rotor that is most of what moves
+    assert heavy != PLAIN and build(heavy, {"backlash": {"gap": 0.1}}).dof_armature.tolist() == [0.0, 50.0]
     with pytest.raises(ValueError, match="backlash.inertia=9.0: all that moves with 'slide' is only 2"):
         build(PLAIN, {"backlash": {"gap": 0.1, "inertia": 9.0}})
 
