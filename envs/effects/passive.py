@@ -82,7 +82,7 @@ def stiffen_dry_friction(joint: mujoco.MjsJoint) -> None:
 
 
 def effective_inertia(spec: mujoco.MjSpec, joints: list[mujoco.MjsJoint]) -> list[float]:
-    """Inertia that a force at each joint has to move in the scene's initial posture, armatures and all, kg or kg m^2."""
+    """Inertia that a force at each joint has to move in the initial posture, armatures and all, kg or kg m^2."""
     model = spec.copy().compile()
     data, whole = mujoco.MjData(model), np.zeros((model.nv, model.nv))
     mujoco.mj_forward(model, data)
