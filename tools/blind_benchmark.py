@@ -5,7 +5,7 @@
                                     [--no-baselines]
 
 The labels' SHA-256 is printed before the solver starts, and checked before scoring. A seed that was used to tune the
-solver must not be reported: 11, 901, 902, 903 and 20261121 to 20261124 so far.
+solver must not be reported: 11, 901 to 904 and 20261121 to 20261124 so far.
 Everything is resumable: what is on disk is not done again. The CSV has one row a score; beside it go <csv>_cases.csv
 with one row a case, <csv>_confusion.png and <csv>_power.png.
 """

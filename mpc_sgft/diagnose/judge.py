@@ -47,6 +47,11 @@ def gain(worse: Array, better: Array, level: float, rng: np.random.Generator) ->
     return Interval(mean, min(float(low), mean - half), max(float(high), mean + half))
 
 
+def worth(error: float) -> float:
+    """The smallest drop of an error, in log(1 + e), that is worth a name."""
+    return max(MIN_GAIN, MIN_SHARE * error)
+
+
 def credible(
     worse: Array,
     better: Array,
@@ -67,7 +72,7 @@ def credible(
     g = gain(worse, better, 2 * GAIN_LEVEL - 1, rng)
     drops = (worse - better).reshape(-1, 1 if one_window else parts).mean(1)
     elsewhere = (drops.sum() - drops.max()) / max(len(drops) - 1, 1)
-    return g.low > 0 and g.mean > max(least, MIN_SHARE * float(worse.mean())) and bool(elsewhere > ELSEWHERE)
+    return g.low > 0 and g.mean > max(least, worth(float(worse.mean()))) and bool(elsewhere > ELSEWHERE)
 
 
 def worse(rival: Array, best: Array, rng: np.random.Generator, odds: float = 0.0) -> bool:

@@ -51,7 +51,9 @@ def choose(setup: Setup[Any], entries: list[Entry], rng: np.random.Generator) ->
         if not better:
             return prune(setup, current, entries, rng)
         smallest = min(e.complexity for e in better)
-        current = min((e for e in better if e.complexity == smallest), key=lambda e: e.error + judge.MIN_GAIN * e.idle)
+        current = min(
+            (e for e in better if e.complexity == smallest), key=lambda e: e.error + judge.worth(e.error) * e.idle
+        )
 
 
 def gains(setup: Setup[Any], small: Entry, large: Entry, rng: np.random.Generator) -> bool:

@@ -81,7 +81,7 @@ def run(
             was, setup = best.error, around(setup, best.fit)
             entries = again(setup, entries, best)
             best = choose_set(setup, entries, rng)
-            if not settled(best) and was - best.error > judge.MIN_GAIN:
+            if not settled(best) and was - best.error > judge.worth(was):
                 entries = search(setup, terms, max_effects, rng, show)
                 best = choose_set(setup, entries, rng)
         flexible = None if settled(best) else flexible_fit(setup, best, sizes, rng)
