@@ -226,6 +226,12 @@ SHARED = """<mujoco><worldbody><geom name="wall" type="plane" size="2 2 1" frict
 <actuator><motor name="x" joint="x"/></actuator></mujoco>"""
 
 
+def test_some_start_of_a_saturation_is_within_a_factor_of_two_of_any_limit(plant) -> None:
+    term = make_term(plant, "torque_saturation", "motor", Scales(peak=8.0))
+    for limit in np.linspace(0.1, 1.0, 19) * 8.0:
+        assert any(0.5 <= float(s[0]) / limit <= 2.0 for s in term.starts), limit
+
+
 def test_what_shares_a_name_keeps_its_own_size_and_what_touches_is_found() -> None:
     plant = Plant(mujoco.MjSpec.from_string(SHARED))
     at = scales(plant, Replayer(plant, [_sine()], 0.5, ["qpos/x"]))
