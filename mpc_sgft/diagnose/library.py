@@ -129,9 +129,8 @@ def make_term(plant: Plant, name: str, place: str, scales: Scales, fixed: Mappin
     hard = np.array([kind.bounds.get(p, (-np.inf, np.inf)) for p in parameters]).reshape(-1, 2)
     soft = np.array([(neutral[i] + par.low * sizes[i], neutral[i] + par.high * sizes[i]) for i, par in enumerate(pars)])
     low, high = np.maximum(hard[:, 0], soft[:, 0]), np.minimum(hard[:, 1], soft[:, 1])
-    starts = [
-        np.array([par.starts[k % len(par.starts)] for par in pars]) for k in range(max(len(p.starts) for p in pars))
-    ]
+    begins = [[s(scales) if callable(s) else s for s in par.starts] for par in pars]
+    starts = [np.array([b[k % len(b)] for b in begins]) for k in range(max(map(len, begins)))]
     at = (place,) if place else ()
     return Term(
         effect=name,

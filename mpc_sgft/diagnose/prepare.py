@@ -230,7 +230,7 @@ def scales(plant: Plant, replayer: Replayer) -> dict[tuple[str, str], Scales]:
     a = np.concatenate([s.a for s in replayer.smooth])
     u = np.concatenate([e.ctrl for e in replayer.episodes])
     pick = np.linspace(0, len(q) - 1, min(200, len(q))).astype(int)
-    forces, inertias, peak, touching = [], [], np.zeros(m.nu), {}
+    forces, inertias, peak, needed, touching = [], [], np.zeros(m.nu), np.zeros(m.nv), {}
     for k in pick:
         data.qpos[:], data.qvel[:], data.ctrl[:] = q[k], v[k], u[k]
         mujoco.mj_forward(m, data)
@@ -239,6 +239,7 @@ def scales(plant: Plant, replayer: Replayer) -> dict[tuple[str, str], Scales]:
         inertias.append(np.diag(full))
         forces.append(np.abs(full @ a[k]) + np.abs(data.qfrc_bias) + np.abs(data.qfrc_actuator))
         peak = np.maximum(peak, np.abs(data.actuator_force))
+        needed = np.maximum(needed, np.abs(full @ a[k] + data.qfrc_bias - data.qfrc_passive))
         for contact in data.contact:
             moves = [g for g in contact.geom if g >= 0 and m.body_weldid[m.geom_bodyid[g]]]
             for g in moves[:1]:  # none where a listed pair touches without moving
@@ -255,7 +256,9 @@ def scales(plant: Plant, replayer: Replayer) -> dict[tuple[str, str], Scales]:
         joint = joint_of(plant, name)
         at = out["joint", joint] if joint else Scales(dt=dt)
         command = float(np.sqrt(np.mean(u[:, i] ** 2))) + 1e-9
-        out["actuator", name] = at._replace(command=command, peak=float(peak[i]) + 1e-9)
+        most = float(peak[i]) + 1e-9
+        ask = float(needed[m.joint(joint).dofadr[0]] / abs(m.actuator(name).gear[0])) if joint else most
+        out["actuator", name] = at._replace(command=command, peak=most, needed=ask)
     for name in plant.bodies:
         out["body", name] = Scales(mass=float(m.body_mass[m.body(name).id]), dt=dt)
     for name, friction in touching.items():

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from envs.effects import place_rotors
+from envs.effects.base import ROTOR
 from mpc_sgft.diagnose.plant import Change, Plant
 from mpc_sgft.diagnose.record import Array, Episode, Index
 from mpc_sgft.diagnose.rub import Drive, rub
@@ -31,6 +32,7 @@ THREADS = int(os.environ.get("OMP_NUM_THREADS", len(os.sched_getaffinity(0))))
 MIN_LAG = 1e-5  # [s] faster than this is no lag
 MOMENT = 1e-5  # [s]
 BEFORE, AFTER, EITHER = (-MOMENT, 0.0), (0.0, MOMENT), (-MOMENT, MOMENT)
+LEAD = 0.3  # [s] before a window, to find the flank on which its rotors lean
 EXPLODED = 1e6  # predictions are clipped here, so that an unstable candidate is bad, not infinite
 
 
@@ -74,6 +76,9 @@ class Replayer:
         self.half = self.h / 2 if plant.model.opt.integrator in leap else 0.0
         self.smooth = [smooth(e, plant.joints) for e in self.episodes]
         self.windows = self._cut(max(2, round(window / self.dt)))
+        first = np.array([self.smooth[i].half for i in self.windows.episode], int)
+        most = min(round(LEAD / self.dt), self.windows.samples)
+        self.ahead: Index | None = np.minimum(most, self.windows.start - first)  # samples that lead to each window
         self._nominal_ctrl: Array | None = None
         self.simulations = 0
 
@@ -114,6 +119,14 @@ class Replayer:
         other._nominal_ctrl = None
         return other
 
+    def led(self) -> Replayer:
+        """Windows that end, or come by, where these begin; as early as smoothing lets them, at most by LEAD."""
+        other, w = copy.copy(self), self.windows
+        assert self.ahead is not None
+        other.windows = self._windows(w.episode, w.start - self.ahead, int(self.ahead.max()))
+        other.ahead, other._nominal_ctrl = None, None
+        return other
+
     def read(self, acting: tuple[float, float]) -> Replayer:
         """The same windows with all forces read BEFORE or AFTER a sample's command is there."""
         other = copy.copy(self)
@@ -132,6 +145,26 @@ class Replayer:
     def _roll(
         self, models: list[mujoco.MjModel], changes: list[Change], pick: Index, shift: Array | None, force: Array | None
     ) -> Array:
+        m = models[0]
+        qadr, vadr = self.plant.addresses(m)
+        state, a = self._begin(models, changes, pick, shift)
+        inputs, states, sensed = self._advance(models, changes, pick, state, force)
+        qpos, qvel = (
+            np.concatenate([state[:, :, None, first + adr], states[..., first + adr]], 2)
+            for first, adr in ((1, qadr), (1 + m.nq, vadr))
+        )
+        late = np.array([[c.late.get(joint, 0.0) for joint in self.plant.joints] for c in changes])
+        felt = self._felt(models, changes, pick, sensed, inputs)
+        out = self._read(qpos, qvel, sensed, felt, m, late, a)
+        for k, change in enumerate(changes if any(c.reads for c in changes) else []):
+            for i, name in enumerate(self.signals):
+                out[k, ..., i] = change.read(out[k, ..., i], name)
+        return out
+
+    def _begin(
+        self, models: list[mujoco.MjModel], changes: list[Change], pick: Index, shift: Array | None
+    ) -> tuple[Array, Array]:
+        """States at the windows' starts, [K, W, …], and the joints' accelerations there if readings are old."""
         m, w, nj, count = models[0], self.windows, len(self.plant.joints), len(pick)
         qadr, vadr = self.plant.addresses(m)
         data = mujoco.MjData(m)
@@ -157,6 +190,38 @@ class Replayer:
         qacc[:, vadr] = w.a0[pick]
         for model, rows in zip(models, state, strict=True):
             place_rotors(model, rows[:, 1 : 1 + m.nq], rows[:, 1 + m.nq : 1 + m.nq + m.nv], qacc)
+        if self.ahead is not None and any(j.name.startswith(ROTOR) for j in map(m.joint, range(m.njnt))):
+            self._lean(models, changes, pick, state)
+        return state, a
+
+    def _lean(self, models: list[mujoco.MjModel], changes: list[Change], pick: Index, state: Array) -> None:
+        """Put rotors where they come to stand against their joints on the way to the windows' starts; in place."""
+        m, before = models[0], self.led()
+        start, _ = before._begin(models, changes, pick, None)
+        _, states, _ = before._advance(models, changes, pick, start, None)
+        way = np.concatenate([start[:, :, None], states], 2)
+        assert self.ahead is not None
+        then = np.round(self.ahead[pick] * self.dt / self.h).astype(int)
+        end = way[:, np.arange(len(pick)), then]
+        for rotor in (j for j in map(m.joint, range(m.njnt)) if j.name.startswith(ROTOR)):
+            joint = m.joint(rotor.name.removeprefix(ROTOR))
+            for first, at, of in ((1, rotor.qposadr, joint.qposadr), (1 + m.nq, rotor.dofadr, joint.dofadr)):
+                state[..., first + at] = state[..., first + of] + end[..., first + at] - end[..., first + of]
+
+    def _advance(
+        self,
+        models: list[mujoco.MjModel],
+        changes: list[Change],
+        pick: Index,
+        state: Array,
+        force: Array | None,
+    ) -> tuple[Array, Array, Array]:
+        """Inputs of each physics step, states after it and what the sensors read, [K, W, N, …] each.
+
+        Activations of the starts are set, in place.
+        """
+        m, count = models[0], len(pick)
+        _, vadr = self.plant.addresses(m)
         nu, extra = len(self.plant.actuators), m.nu - len(self.plant.actuators)
         inputs = np.zeros((len(models), count, self.steps, m.nu + (m.nv if force is not None else 0)))
         order = [m.actuator(a).id for a in self.plant.actuators] if extra else list(range(nu))
@@ -177,17 +242,8 @@ class Replayer:
             each = [x for x in models for _ in range(count)]
             workers = [mujoco.MjData(m) for _ in range(THREADS)]
             states, sensed = mujoco.rollout.rollout(each, workers, starts, driven, control_spec=control)
-        states, sensed = np.asarray(states, float), np.asarray(sensed, float)
-        shape = (len(models), count, self.steps)
-        qpos = np.concatenate([state[:, :, None, 1 + qadr], states[..., 1 + qadr].reshape(*shape, nj)], 2)
-        qvel = np.concatenate([state[:, :, None, 1 + m.nq + vadr], states[..., 1 + m.nq + vadr].reshape(*shape, nj)], 2)
-        late = np.array([[c.late.get(joint, 0.0) for joint in self.plant.joints] for c in changes])
-        felt = self._felt(models, changes, pick, sensed.reshape(*shape, -1), inputs)
-        out = self._read(qpos, qvel, sensed.reshape(*shape, -1), felt, m, late, a)
-        for k, change in enumerate(changes if any(c.reads for c in changes) else []):
-            for i, name in enumerate(self.signals):
-                out[k, ..., i] = change.read(out[k, ..., i], name)
-        return out
+        shape = (len(models), count, self.steps, -1)
+        return inputs, np.asarray(states, float).reshape(shape), np.asarray(sensed, float).reshape(shape)
 
     def _start(self, joint: int, late: float, pick: Index) -> Array:
         """True position, velocity and acceleration of a joint at the windows' starts, [3, W], if readings are old."""
@@ -299,6 +355,10 @@ class Replayer:
             first = np.arange(self.smooth[i].half, len(e.ctrl) - n, n)
             episode += [i] * len(first)
             start += list(first)
+        return self._windows(np.array(episode), np.array(start), n)
+
+    def _windows(self, episode: Index, start: Index, n: int) -> Windows:
+        """Windows of n samples after these starts."""
         rows = [(i, np.arange(s + 1, s + n + 1)) for i, s in zip(episode, start, strict=True)]
         measured = np.array([[self.episodes[i].signals[name][r] for name in self.signals] for i, r in rows])
 
@@ -308,8 +368,8 @@ class Replayer:
         off = np.array([np.broadcast_to(self.episodes[i].off_tick, len(self.episodes[i].ctrl))[r] for i, r in rows])
         known = np.isfinite(off)[..., None]
         return Windows(
-            np.array(episode),
-            np.array(start),
+            episode,
+            start,
             n,
             np.moveaxis(measured, 1, 2),
             at_start("q"),

@@ -16,6 +16,7 @@ class Scales(NamedTuple):
     inertia: float = 1.0  # kg or kg m^2 at the joint
     command: float = 1.0  # of the actuator
     peak: float = 1.0  # largest force of the actuator, N or N m
+    needed: float = 0.5  # largest force that the measured motion asks of it, N or N m
     mass: float = 1.0  # kg of the body
     friction: float = 1.0  # sliding friction of the geom's contacts
     dt: float = 0.001  # s between samples
@@ -26,7 +27,7 @@ class Par(NamedTuple):
 
     neutral: float | Callable[[Scales], float]
     size: Callable[[Scales], float]
-    starts: tuple[float, ...] = (0.1,)
+    starts: tuple[float | Callable[[Scales], float], ...] = (0.1,)
     low: float = -100.0
     high: float = 100.0
     hop: Callable[[Scales], float] = lambda s: 0.0  # between values that fit about as well: fits try neighbours
@@ -37,6 +38,11 @@ class Row(NamedTuple):
     driven: bool = False  # only where a motor sits
     sums: Mapping[str, tuple[str, str]] = {}  # the effect's parameter -> fitted ones that it is the sum of
     variants: Sequence[Mapping[str, float]] = ({},)  # parameters that are held, one candidate each
+
+
+def _saturated(s: Scales) -> float:
+    """Wherever the motion needs most."""
+    return min(s.needed / s.peak, 1.0) - 1
 
 
 _force, _viscous = (lambda s: s.force), (lambda s: s.force / s.speed)
@@ -74,7 +80,7 @@ TABLE: dict[str, Row] = {
     "actuator_offset": Row({"offset": Par(0.0, lambda s: s.command, (0.05, -0.05))}),
     "deadband": Row({"width": Par(0.0, lambda s: s.command, (0.05, 0.3), 0.0, 3.0)}),
     "torque_saturation": Row(
-        {"limit": Par(lambda s: s.peak, lambda s: s.peak, (-0.15, -0.5, -0.75, -0.88), -0.97, 0.0)}
+        {"limit": Par(lambda s: s.peak, lambda s: s.peak, (-0.15, -0.5, -0.75, -0.88, _saturated), -0.999, 0.0)}
     ),
     "sensor_offset": Row({"offset": Par(0.0, lambda s: s.travel, (0.1, -0.1), -3.0, 3.0)}),
     "sensor_gain": Row({"gain": Par(1.0, lambda s: 1.0, (-0.05, 0.05), -0.8, 2.0)}),

@@ -300,3 +300,20 @@ def test_a_position_is_as_uncertain_as_its_smoothing_bends_it() -> None:
     s = smooth(Episode("a", 0.002, np.zeros((2000, 1)), {"qpos/x": q, "qvel/x": speed}), ["x"])
     off = (np.abs(s.q[:, 0] - true) / s.q_sd[:, 0])[s.half : -s.half]
     assert (off < 3).mean() > 0.97 and off.max() < 10, (np.mean(off < 3), off.max())
+
+
+def test_rotors_come_to_the_window_as_the_motion_before_left_them() -> None:
+    """Within the play nothing pushes the joint, so that its acceleration does not tell where the rotor is."""
+    plant = Plant(mujoco.MjSpec.from_string(SLIDE.replace('axis="1 0 0"/>', 'axis="1 0 0" armature="0.5"/>')))
+    play = make_term(plant, "backlash", "x", Scales()).build(np.array([0.02]))
+    m, u = plant.compile(play), 4 * np.cos(3 * 0.002 * np.arange(3000))
+    data, q = mujoco.MjData(m), []
+    for command in u:
+        q.append(data.qpos[0])
+        data.ctrl[0] = command
+        mujoco.mj_step(m, data)
+    replayer = Replayer(plant, [Episode("play", 0.002, u[:, None], {"qpos/x": np.array(q)})], 0.3, ["qpos/x"])
+    led = np.abs(replayer.simulate([play])[0] - replayer.windows.measured)[1:, -1, 0]
+    replayer.ahead = None
+    guessed = np.abs(replayer.simulate([play])[0] - replayer.windows.measured)[1:, -1, 0]
+    assert (guessed > 3e-3).sum() > 2 > (led > 2e-3).sum() and led.mean() < 0.4 * guessed.mean()
