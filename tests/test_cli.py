@@ -71,7 +71,7 @@ def test_help_lists_the_names_and_loads_nothing_heavy(name: str, tmp_path: Path)
 def test_groups_and_effects_are_the_files_on_disk() -> None:
     assert {"task", "gap", "planner", "model", "backend", "experiment"} <= set(choices.groups())
     assert "none" in choices.groups()["gap"]
-    assert "actuator_gain" in choices.effects() and choices.effects() == available()
+    assert "actuator_gain" in choices.effects() and tuple(choices.effects()) == available()
 
 
 @pytest.mark.parametrize(

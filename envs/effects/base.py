@@ -14,6 +14,7 @@ import pkgutil
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from difflib import get_close_matches
+from functools import cache
 from typing import Any, ClassVar
 
 import mujoco
@@ -105,11 +106,12 @@ class Effect:
         return values
 
 
-def available() -> list[str]:
+@cache
+def available() -> tuple[str, ...]:
     """Names of the effects, which are the names of the files in this folder."""
     import envs.effects as package
 
-    return sorted(m.name for m in pkgutil.iter_modules(package.__path__) if m.name not in ("base", "passive"))
+    return tuple(sorted(m.name for m in pkgutil.iter_modules(package.__path__) if m.name not in ("base", "passive")))
 
 
 Parameters = Mapping[str, Any] | None

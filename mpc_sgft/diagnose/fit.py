@@ -168,24 +168,30 @@ def fit(
     if not flat.count:
         r = problem.residuals(terms, [start], pick)[0]
         return Fit(tuple(terms), tuple(start), r, np.zeros((*r.shape, 0)))
-    x = _descend(problem, flat, x, pick, iterations)
+    x, r, J = _descend(problem, flat, x, pick, iterations)
     if flat.hops.any() and (elsewhere := _hop(problem, flat, x, pick)) is not x:
-        x = _descend(problem, flat, elsewhere, pick, iterations)
+        x, r, J = _descend(problem, flat, elsewhere, pick, iterations)
     if problem.pattern:
-        x = _walk(problem, flat, x, pick)
-    r, J = _linearise(problem, flat, x, pick)
+        x, r, J = _walk(problem, flat, x, pick), None, None
+    if r is None or J is None:
+        r, J = _linearise(problem, flat, x, pick, r)
     return Fit(tuple(terms), tuple(flat.unpack(x)), r, J)
 
 
-def _descend(problem: Residuals, flat: _Flat, x: Array, pick: Index, iterations: int) -> Array:
-    damping = 1e-2
+def _descend(
+    problem: Residuals, flat: _Flat, x: Array, pick: Index, iterations: int
+) -> tuple[Array, Array | None, Array | None]:
+    """Where it ends, and residuals and derivatives there as far as they are known."""
+    damping, r, J = 1e-2, None, None
     for _ in range(iterations):
-        r, J = _linearise(problem, flat, x, pick)
+        if r is None or J is None:
+            r, J = _linearise(problem, flat, x, pick, r)
         w = weights(r)
         A, g = np.einsum("w,wmp,wmq->pq", w, J, J, optimize=True), np.einsum("w,wmp,wm->p", w, J, r, optimize=True)
         tries = [flat.clip(x + _step(A, g, lam, x, flat)) for lam in (damping / 10, damping, damping * 30)]
         scale = typical(r)
-        costs = robust(problem.residuals(flat.terms, [flat.unpack(t) for t in tries], pick), scale)
+        tried = problem.residuals(flat.terms, [flat.unpack(t) for t in tries], pick)
+        costs = robust(tried, scale)
         best = int(np.argmin(costs))
         before = float(robust(r, scale))
         damping = min(max(damping * (0.1, 1.0, 30.0)[best], 1e-8), 1e8)
@@ -194,10 +200,10 @@ def _descend(problem: Residuals, flat: _Flat, x: Array, pick: Index, iterations:
             if damping > 1e4:
                 break
             continue
-        x = tries[best]
+        x, r, J = tries[best], tried[best], None
         if before - costs[best] < TOLERANCE * before:
             break
-    return x
+    return x, r, J
 
 
 def _hop(problem: Residuals, flat: _Flat, x: Array, pick: Index) -> Array:
@@ -236,11 +242,14 @@ def _best_nearby(problem: Residuals, flat: _Flat, x: Array, pick: Index, moves: 
     return x
 
 
-def _linearise(problem: Residuals, flat: _Flat, x: Array, pick: Index) -> tuple[Array, Array]:
+def _linearise(problem: Residuals, flat: _Flat, x: Array, pick: Index, r: Array | None = None) -> tuple[Array, Array]:
+    """Residuals at a point [W, m], simulated if they are not given, and their derivatives [W, m, P]."""
     steps = flat.steps(x, problem.step)
-    points = [x, *(x + steps[i] * np.eye(flat.count)[i] for i in range(flat.count))]
+    points = [*([x] if r is None else []), *(x + steps[i] * np.eye(flat.count)[i] for i in range(flat.count))]
     all_r = problem.residuals(flat.terms, [flat.unpack(p) for p in points], pick)
-    return all_r[0], np.moveaxis((all_r[1:] - all_r[0]) / steps[:, None, None], 0, -1)
+    if r is None:
+        r, all_r = all_r[0], all_r[1:]
+    return r, np.moveaxis((all_r - r) / steps[:, None, None], 0, -1)
 
 
 def _step(A: Array, g: Array, damping: float, x: Array, flat: _Flat) -> Array:
