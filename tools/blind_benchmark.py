@@ -17,7 +17,10 @@ import os
 import platform
 import sys
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import suppress
+from multiprocessing import Manager
 from pathlib import Path
+from queue import Empty
 from typing import Any
 
 from tqdm import tqdm
@@ -25,14 +28,17 @@ from tqdm import tqdm
 from tools.blind import baselines, cases, fr3_draw, fr3_make, score
 from tools.blind.draw import draw
 from tools.blind.make import make
+from tools.blind.plants import PLANTS
 from tools.blind.plots import draw as draw_plots
 from tools.blind.solve import reports, solve_all
 
 STEPS = ("generate", "run", "score")
 
 
-def generate(out: Path, seed: int, count: int, least_none: int, arms: int = 0) -> str:
+def generate(out: Path, seed: int, count: int, least_none: int, arms: int = 0, jobs: int = 1) -> str:
     """Cases and labels on disk, `arms` of the FR3 last; the labels' hash. Nothing is made anew if they are there.
+
+    The cases do not depend on the number of jobs.
 
     Raises:
         ValueError: If the folder holds cases of another seed or another number of them.
@@ -48,8 +54,16 @@ def generate(out: Path, seed: int, count: int, least_none: int, arms: int = 0) -
                 "Give another --out, or delete that folder."
             )
         return (out / "labels.sha256").read_text().strip()
-    with tqdm(total=total, desc="generate", unit="case") as bar:
-        return cases.write(out, make(drawn, bar.update) + fr3_make.make(extra, bar.update), seed)
+    parts = [(make, [c for c in drawn if c.plant == plant]) for plant in PLANTS] + [(fr3_make.make, [c]) for c in extra]
+    with tqdm(total=total, desc="generate", unit="case") as bar, Manager() as manager:
+        done = manager.Queue()  # cases, and shares of them, that a process has finished
+        with ProcessPoolExecutor(jobs) as pool:
+            futures = [pool.submit(how, few, done.put) for how, few in parts if few]
+            while not all(f.done() for f in futures) or not done.empty():
+                with suppress(Empty):
+                    bar.update(done.get(timeout=0.5))
+        made = {one.case.name: one for f in futures for one in f.result()}
+    return cases.write(out, [made[c.name] for c in drawn + extra], seed)
 
 
 def run(out: Path, jobs: int) -> None:
@@ -151,7 +165,7 @@ def main(argv: list[str]) -> int:
     steps = (args.only,) if args.only else STEPS
     try:
         if "generate" in steps:
-            generate(args.out, args.seed, args.cases, args.least_none, args.fr3)
+            generate(args.out, args.seed, args.cases, args.least_none, args.fr3, args.jobs)
         cases.labels(args.out)
         if cases.seed_of(args.out) != args.seed:
             raise ValueError(f"{args.out} holds cases of seed {cases.seed_of(args.out)}, not of {args.seed}")

@@ -2,5 +2,6 @@
 
 from envs.effects.backlash import place_rotors
 from envs.effects.base import Effect, available, load
+from envs.effects.stribeck_friction import bend_bristles, bristles
 
-__all__ = ["Effect", "available", "load", "place_rotors"]
+__all__ = ["Effect", "available", "bend_bristles", "bristles", "load", "place_rotors"]

@@ -22,7 +22,7 @@ from mpc_sgft.diagnose.signals import SIGNALS
 from mpc_sgft.diagnose.table import INCLUDES, TABLE, Scales
 from mpc_sgft.errors import UserError, unknown
 
-HIDDEN = ("velocity", "rest")  # parameters that mean nothing while the effect is neutral
+HIDDEN = ("velocity", "rest", "deflection", "damping_ratio")  # parameters that mean nothing while the effect is neutral
 LONG = (int(mujoco.mjtGeom.mjGEOM_CAPSULE), int(mujoco.mjtGeom.mjGEOM_CYLINDER))
 
 

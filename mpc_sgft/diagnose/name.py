@@ -103,7 +103,7 @@ def judge_entries(
     """
     best = choose(setup, entries, rng)
     probability = dict.fromkeys((e.key for e in entries), 0.0)
-    rivals = [e for e in entries if e.complexity <= max(best.complexity, 1)]  # larger sets are no more credible
+    rivals = [e for e in entries if e.complexity <= 1 or no_larger(e, best)]  # larger sets are no more credible
     shares = judge.win_shares(
         np.array([e.errors for e in rivals]), np.array([e.complexity for e in rivals]), rng, setup.problem.blocks
     )
@@ -133,10 +133,16 @@ def judge_entries(
 
 
 def find_ties(setup: Setup[Any], best: Entry, entries: list[Entry], rng: np.random.Generator) -> list[Entry]:
-    """Sets of no more names and parameters than the best that are not credibly worse, best first."""
-    rivals = [e for e in entries if 0 < e.complexity <= best.complexity and 0 < e.effects <= best.effects]
-    tied = [e for e in rivals if e is not best and not judge.worse(e.errors, best.errors, rng, odds(setup, best, e))]
+    """Other sets of no more names and parameters than the best that are not credibly worse, best first."""
+    rivals = [e for e in entries if 0 < e.effects <= best.effects and 0 < e.complexity and no_larger(e, best)]
+    other = [e for e in rivals if sorted(e.names) != sorted(best.names)]
+    tied = [e for e in other if not judge.worse(e.errors, best.errors, rng, odds(setup, best, e))]
     return sorted(tied, key=lambda e: e.error)
+
+
+def no_larger(e: Entry, best: Entry) -> bool:
+    """Whether a set has no more parameters: that show in the data, or by its terms, where one shows just so."""
+    return e.complexity <= best.complexity or sum(map(len, e.values)) <= sum(map(len, best.values))
 
 
 def odds(setup: Setup[Any], best: Entry, rival: Entry) -> float:

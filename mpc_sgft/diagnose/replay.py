@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from envs.effects import place_rotors
+from envs.effects import bend_bristles, bristles, place_rotors
 from envs.effects.base import ROTOR
 from mpc_sgft.diagnose.plant import Change, Plant
 from mpc_sgft.diagnose.record import Array, Episode, Index
@@ -32,7 +32,7 @@ THREADS = int(os.environ.get("OMP_NUM_THREADS", len(os.sched_getaffinity(0))))
 MIN_LAG = 1e-5  # [s] faster than this is no lag
 MOMENT = 1e-5  # [s]
 BEFORE, AFTER, EITHER = (-MOMENT, 0.0), (0.0, MOMENT), (-MOMENT, MOMENT)
-LEAD = 0.3  # [s] before a window, to find the flank on which its rotors lean
+LEAD = 0.3  # [s] before a window, to find how rotors lean and bristles bend at its start
 EXPLODED = 1e6  # predictions are clipped here, so that an unstable candidate is bad, not infinite
 
 
@@ -189,13 +189,18 @@ class Replayer:
         qacc = np.zeros((count, m.nv))
         qacc[:, vadr] = w.a0[pick]
         for model, rows in zip(models, state, strict=True):
-            place_rotors(model, rows[:, 1 : 1 + m.nq], rows[:, 1 + m.nq : 1 + m.nq + m.nv], qacc)
-        if self.ahead is not None and any(j.name.startswith(ROTOR) for j in map(m.joint, range(m.njnt))):
-            self._lean(models, changes, pick, state)
+            qpos, qvel, act = np.split(rows[:, 1 : 1 + m.nq + m.nv + m.na], [m.nq, m.nq + m.nv], 1)
+            place_rotors(model, qpos, qvel, qacc)
+            bend_bristles(model, qvel, act)
+        rotors = [j for j in map(m.joint, range(m.njnt)) if j.name.startswith(ROTOR)]
+        if self.ahead is not None and (rotors or bristles(m)):
+            self._lead(models, changes, pick, state, rotors)
         return state, a
 
-    def _lean(self, models: list[mujoco.MjModel], changes: list[Change], pick: Index, state: Array) -> None:
-        """Put rotors where they come to stand against their joints on the way to the windows' starts; in place."""
+    def _lead(
+        self, models: list[mujoco.MjModel], changes: list[Change], pick: Index, state: Array, rotors: list[Any]
+    ) -> None:
+        """Put rotors and bristles where they come to stand on the way to the windows' starts; in place."""
         m, before = models[0], self.led()
         start, _ = before._begin(models, changes, pick, None)
         _, states, _ = before._advance(models, changes, pick, start, None)
@@ -203,7 +208,9 @@ class Replayer:
         assert self.ahead is not None
         then = np.round(self.ahead[pick] * self.dt / self.h).astype(int)
         end = way[:, np.arange(len(pick)), then]
-        for rotor in (j for j in map(m.joint, range(m.njnt)) if j.name.startswith(ROTOR)):
+        bent = 1 + m.nq + m.nv + m.actuator_actadr[bristles(m)]
+        state[..., bent] = end[..., bent]
+        for rotor in rotors:
             joint = m.joint(rotor.name.removeprefix(ROTOR))
             for first, at, of in ((1, rotor.qposadr, joint.qposadr), (1 + m.nq, rotor.dofadr, joint.dofadr)):
                 state[..., first + at] = state[..., first + of] + end[..., first + at] - end[..., first + of]
@@ -229,9 +236,9 @@ class Replayer:
             inputs[k, :, :, order] = np.moveaxis(self._ctrl(change, pick), -1, 0)
         if force is not None:
             inputs[..., m.nu + vadr] = force
-        if m.na:
-            first = [a for a in range(m.na) if a < nu]
-            state[:, :, 1 + m.nq + m.nv + np.array(first)] = inputs[:, :, 0, first]
+        for column, name in zip(order, self.plant.actuators, strict=True):
+            if (filtered := m.actuator_actadr[m.actuator(name).id]) >= 0:
+                state[:, :, 1 + m.nq + m.nv + filtered] = inputs[:, :, 0, column]
         rows = len(models) * count
         starts, driven, control = state.reshape(rows, -1), inputs.reshape(rows, self.steps, -1), FORCED
         if force is None:

@@ -221,7 +221,10 @@ def test_places_and_natives_are_told() -> None:
         ({"gravity_tilt": {"angle": 10.0}}, "GravityTilt.angle=10.0 rad"),
         ({"contact_softness": {"time_constant": 2.0}}, "ContactSoftness.time_constant=2.0 s"),
         ({"sensor_gain": {"gain": 9.0}}, "SensorGain.gain=9.0 1: allowed are -5.0 to 5.0"),
-        ({"stribeck_friction": {"speed": 1.0}}, "no parameter 'speed'. It has: coulomb, static, velocity, at"),
+        (
+            {"stribeck_friction": {"speed": 1.0}},
+            "no parameter 'speed'. It has: coulomb, static, velocity, deflection, damping_ratio, at",
+        ),
     ],
 )
 def test_what_makes_no_sense_is_refused(effect, message) -> None:

@@ -115,6 +115,49 @@ def test_a_level_stribeck_curve_is_coulomb_friction(build, simulate) -> None:
     np.testing.assert_allclose(level, same, atol=1e-9)
 
 
+@pytest.mark.parametrize("deflection", [0.002, 0.02])
+def test_stribeck_friction_with_bristles_is_lugre_friction(build, deflection) -> None:
+    """In steps of 0.1 ms: MuJoCo's is of the first order."""
+    coulomb, static, velocity, ratio, step = 1.0, 1.8, 0.05, 0.4, 1e-4
+    numbers = {"coulomb": coulomb, "static": static, "velocity": velocity, "deflection": deflection}
+    stiffness = static / deflection
+    damping = 2 * ratio * np.sqrt(stiffness * MASS)
+
+    def motion(t, state):
+        _, v, z = state
+        level = coulomb + (static - coulomb) * np.exp(-((v / velocity) ** 2))
+        bend = v - stiffness * abs(v) * z / level
+        return [v, (2.6 * np.sin(4.4 * t) - stiffness * z - damping * bend) / MASS, bend]
+
+    t = step * np.arange(20000)
+    truth = solve_ivp(motion, (0, t[-1]), [0, 0, 0], t_eval=t, rtol=1e-7, atol=1e-9, max_step=1e-3).y[0]
+    scene = SLIDE.replace(f'timestep="{STEP}"', f'timestep="{step}"')
+    positions = {}
+    for name, more in {"bristles": {"damping_ratio": ratio}, "rigid": {"deflection": 0.0}}.items():
+        model = build(scene, {"stribeck_friction": numbers | more})
+        data, positions[name] = mujoco.MjData(model), []
+        for force in 2.6 * np.sin(4.4 * (t + step / 2)):
+            positions[name].append(data.qpos[0])
+            data.ctrl[0] = force
+            mujoco.mj_step(model, data)
+    off = {name: np.abs(np.array(q) - truth).max() / np.ptp(truth) for name, q in positions.items()}
+    assert off["bristles"] < 0.01 < 0.03 < off["rigid"], off
+
+
+def test_bristles_are_bent_as_far_as_they_stay_while_sliding(build) -> None:
+    model = build(SLIDE, {"stribeck_friction": {"coulomb": 1.0, "static": 1.8, "velocity": 0.05, "deflection": 0.01}})
+    data = mujoco.MjData(model)
+    for speed in (-0.5, -0.03, 0.04, 1.0):
+        data.qvel[0] = speed
+        effects.bend_bristles(model, data.qvel, data.act)
+        mujoco.mj_forward(model, data)
+        level = 1.0 + 0.8 * np.exp(-((speed / 0.05) ** 2))
+        assert MASS * data.qacc[0] == pytest.approx(-np.sign(speed) * level, rel=1e-3) and abs(data.act_dot[0]) < 1e-4
+    data.qvel[0] = 0.0
+    effects.bend_bristles(model, data.qvel, data.act)
+    assert data.act[0] == 0.0
+
+
 def test_a_fall_too_fast_for_the_time_step_stays_finite(build, simulate) -> None:
     model = build(SLIDE, {"stribeck_friction": {"coulomb": 1.0, "static": 100.0, "velocity": 1e-6}})
     q, v = simulate(model, _sine(150.0, 1.0, 2.0))

@@ -247,7 +247,7 @@ def test_a_richer_effect_starts_as_the_simpler_one(plant) -> None:
         ("asymmetric_friction", "viscous_friction", 0.7),
         ("stribeck_friction", "coulomb_friction", 0.3),
     ):
-        old, new = (make_term(plant, n, "x", Scales()) for n in (simple, rich))
+        old, new = (make_term(plant, n, "x", Scales(), TABLE[n].variants[0]) for n in (simple, rich))
         a, b = replayer.simulate([old.build(np.array([value])), new.build(enrich(new, old, np.array([value]))[0])])
         np.testing.assert_allclose(a, b, atol=1e-7)
 
@@ -317,3 +317,20 @@ def test_rotors_come_to_the_window_as_the_motion_before_left_them() -> None:
     replayer.ahead = None
     guessed = np.abs(replayer.simulate([play])[0] - replayer.windows.measured)[1:, -1, 0]
     assert (guessed > 3e-3).sum() > 2 > (led > 2e-3).sum() and led.mean() < 0.4 * guessed.mean()
+
+
+def test_bristles_come_to_the_window_as_the_motion_before_bent_them(plant) -> None:
+    """Where a joint hardly moves, its speed does not tell how far its bristles are bent."""
+    numbers = np.array([1.0, 0.5, 0.05, 0.01, 0.3])  # coulomb, excess, velocity, deflection, damping ratio
+    lugre = make_term(plant, "stribeck_friction", "x", Scales()).build(numbers)
+    m, u = plant.compile(lugre), 2 * np.cos(3 * 0.002 * np.arange(3000))
+    data, q = mujoco.MjData(m), []
+    for command in u:
+        q.append(data.qpos[0])
+        data.ctrl[0] = command
+        mujoco.mj_step(m, data)
+    replayer = Replayer(plant, [Episode("dry", 0.002, u[:, None], {"qpos/x": np.array(q)})], 0.3, ["qpos/x"])
+    led = np.abs(replayer.simulate([lugre])[0] - replayer.windows.measured)[1:, -1, 0]
+    replayer.ahead = None
+    guessed = np.abs(replayer.simulate([lugre])[0] - replayer.windows.measured)[1:, -1, 0]
+    assert np.median(led) < 1e-3 and led.mean() < 0.4 * guessed.mean()

@@ -58,7 +58,7 @@ def test_an_effect_far_below_its_typical_size_is_seen(
 
 def test_a_richer_effect_starts_where_the_simpler_one_ended_whatever_its_idle_parameters() -> None:
     plant = Plant(mujoco.MjSpec.from_string(HINGE))
-    dry, rich = candidates(
+    dry, rich, _ = candidates(
         plant, {("joint", "hinge"): Scales(force=2.0, speed=1.0)}, ["coulomb_friction", "stribeck_friction"]
     )
     starts = enrich(rich, dry, np.array([0.7]))
