@@ -245,11 +245,11 @@ def _best_nearby(problem: Residuals, flat: _Flat, x: Array, pick: Index, moves: 
 def _linearise(problem: Residuals, flat: _Flat, x: Array, pick: Index, r: Array | None = None) -> tuple[Array, Array]:
     """Residuals at a point [W, m], simulated if they are not given, and their derivatives [W, m, P]."""
     steps = flat.steps(x, problem.step)
-    points = [*([x] if r is None else []), *(x + steps[i] * np.eye(flat.count)[i] for i in range(flat.count))]
-    all_r = problem.residuals(flat.terms, [flat.unpack(p) for p in points], pick)
-    if r is None:
-        r, all_r = all_r[0], all_r[1:]
-    return r, np.moveaxis((all_r - r) / steps[:, None, None], 0, -1)
+    points = [x, *(x + steps[i] * np.eye(flat.count)[i] for i in range(flat.count))]
+    new = points if r is None else points[1:]
+    all_r = problem.residuals(flat.terms, [flat.unpack(p) for p in new], pick)
+    here, around = (all_r[0], all_r[1:]) if r is None else (r, all_r)
+    return here, np.moveaxis((around - here) / steps[:, None, None], 0, -1)
 
 
 def _step(A: Array, g: Array, damping: float, x: Array, flat: _Flat) -> Array:
