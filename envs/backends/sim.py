@@ -78,6 +78,7 @@ class SimBackend:
         self.actuators = [nominal.actuator(i).name for i in range(nominal.nactuator)]
         self.counters: Counter[str] = Counter()
         self.note = ""
+        self.filters = [i for i in range(nominal.nactuator) if self.model.actuator_actadr[i] >= 0]  # lags
         self.slots = [_history_values(self.model, i) for i in range(self.model.nu)]
         self.record = ("qpos", "qvel", "actuator_force")
         self.target = np.zeros((num_envs, task.start(np.random.default_rng(0)).target.shape[1]))
@@ -116,8 +117,8 @@ class SimBackend:
         if 0 in sims:
             self.meant = self.target[:1].copy(), self.told[:1].copy()
         self.unstable[sims] = False
-        if self.model.na:
-            self.act[sims] = ctrl
+        if self.filters:
+            self.act[np.ix_(sims, self.model.actuator_actadr[self.filters])] = ctrl[:, self.filters]
         for actuator, slots in enumerate(self.slots):
             if slots is not None:
                 self.delayed[np.ix_(sims, slots)] = ctrl[:, actuator, None]

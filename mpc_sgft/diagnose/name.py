@@ -141,7 +141,7 @@ def find_ties(setup: Setup[Any], best: Entry, entries: list[Entry], rng: np.rand
 
 
 def no_larger(e: Entry, best: Entry) -> bool:
-    """Whether a set has no more parameters: that show in the data, or by its terms, where one shows just so."""
+    """Whether a set has no more parameters than the best, of those that show in the data or of all."""
     return e.complexity <= best.complexity or sum(map(len, e.values)) <= sum(map(len, best.values))
 
 

@@ -79,8 +79,8 @@ def _move(model: mujoco.MjModel, nominal: mujoco.MjModel, steps: int = 60) -> np
         data.qpos[:7] = [0.0, -0.3, 0.0, -2.2, 0.0, 2.0, 0.785]
     effects.place_rotors(model, data.qpos, data.qvel)
     rest, moved = data.qpos[: nominal.nu].copy() if nominal.nu == 7 else 0.0, []
-    if model.na:
-        data.act[:] = rest
+    if len(lags := [a for a in model.actuator_actadr[: nominal.nactuator] if a >= 0]):
+        data.act[lags] = rest
     for k in range(steps):
         data.ctrl[:] = rest + 0.4 * np.sin(0.1 * k + np.arange(nominal.nu))
         mujoco.mj_step(model, data)
@@ -130,6 +130,18 @@ def test_an_effect_fits_the_scene_and_its_mjcf(make_task, plant, name) -> None:
         assert np.abs(moved - plain).max() > 1e-6
     reloaded = mujoco.MjModel.from_xml_string(edited.to_xml())
     np.testing.assert_allclose(_move(reloaded, nominal), moved, atol=1e-6)
+
+
+@pytest.mark.parametrize("plant", PLANTS)
+def test_bristles_fit_the_scene_and_its_mjcf(make_task, plant) -> None:
+    spec = _scene(plant, make_task)
+    nominal = spec.copy().compile()
+    edited = _edited(spec, "stribeck_friction", SIZES["stribeck_friction"] | {"deflection": 0.001})
+    model = edited.compile()
+    assert model.nu == nominal.nu and model.na > nominal.na
+    moved = _move(model, nominal)
+    assert np.isfinite(moved).all() and np.abs(moved - _move(nominal, nominal)).max() > 1e-6
+    np.testing.assert_allclose(_move(mujoco.MjModel.from_xml_string(edited.to_xml()), nominal), moved, atol=1e-6)
 
 
 @pytest.mark.parametrize("name", sorted(set(NATIVE) & set(SIZES)))

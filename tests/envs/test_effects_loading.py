@@ -45,6 +45,15 @@ def test_an_effect_of_zero_size_is_none(make_env, play, random_actions, name) ->
     )
 
 
+def test_bristles_are_an_effect_of_an_environment_that_a_reset_forgets(make_env, play, random_actions) -> None:
+    gap = {"stribeck_friction": {"coulomb": 2.0, "static": 4.0, "velocity": 0.05, "deflection": 0.001}}
+    bent, without = make_env("push", 2, effects_=gap), make_env("push", 2)
+    actions = random_actions(4, 2, bent.action_dim)
+    first, again, plain = (play(env, actions)["observation"].numpy() for env in (bent, bent, without))
+    assert np.isfinite(first).all() and np.abs(first - plain).max() > 1e-4
+    np.testing.assert_array_equal(first, again)
+
+
 def test_an_unknown_effect_names_the_known_and_the_nearest() -> None:
     with pytest.raises(ValueError, match="No effect 'actuator_gian'.*Available: .*payload.*Did you mean actuator_gain"):
         effects.load({"actuator_gian": {}})
