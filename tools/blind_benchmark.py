@@ -61,7 +61,7 @@ def generate(out: Path, seed: int, count: int, least_none: int, arms: int = 0, j
             futures = [pool.submit(how, few, done.put) for how, few in parts if few]
             while not all(f.done() for f in futures) or not done.empty():
                 with suppress(Empty):
-                    bar.update(done.get(timeout=0.5))
+                    bar.update(min(done.get(timeout=0.5), total - bar.n))  # shares may add up to a little more
         made = {one.case.name: one for f in futures for one in f.result()}
     return cases.write(out, [made[c.name] for c in drawn + extra], seed)
 

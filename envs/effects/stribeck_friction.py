@@ -31,9 +31,10 @@ class StribeckFriction(Effect):
     friction that rises with speed.
 
     With a `deflection` it is LuGre friction (Canudas de Wit et al., IEEE TAC 40(3), 1995), MuJoCo's own: bristles of
-    stiffness static / deflection bend before they slide, so that over a short way the force does not reach its static
-    level. A deflection too small for the time step is one that it can resolve. What the bristles damp, MuJoCo's
-    implicit integrators take for damping while they slide, too: an error that vanishes with the time step.
+    stiffness static / deflection, or coulomb / deflection if that is more, bend before they slide, so that over a short
+    way the force does not reach its static level. A deflection too small for the time step is one that it can resolve.
+    What the bristles damp, MuJoCo's implicit integrators take for damping while they slide, too: an error that vanishes
+    with the time step.
     """
 
     coulomb: float = 0.0

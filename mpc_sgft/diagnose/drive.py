@@ -18,10 +18,9 @@ from envs.effects.actuator_lag import ActuatorLag
 from envs.effects.base import Effect
 from envs.task import AbstractTask, whole_steps
 from mpc_sgft.diagnose.deployment import Rollout
+from mpc_sgft.diagnose.held import MIN_LAG
 from mpc_sgft.diagnose.record import Array
 from mpc_sgft.errors import UserError
-
-MIN_LAG = 1e-5  # [s] faster than this is no lag
 
 
 def measured_drive(model: mujoco.MjModel, episode: Rollout) -> Array:

@@ -125,7 +125,7 @@ class Plant:
         spec = self.spec.copy()
         spec.option.timestep /= max(1, np.ceil(spec.option.timestep / SHARP - 1e-9))
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-        spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_ISLAND)  # they cost time, and change nothing
+        spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_ISLAND)  # a few joints need none
         for joint in spec.joints:
             stiffen_dry_friction(joint)
         return Plant(spec)

@@ -13,9 +13,10 @@ from mpc_sgft.diagnose.fit import Discrepancy, Fit, Problem, Residuals, by_parts
 from mpc_sgft.diagnose.library import Term
 from mpc_sgft.diagnose.plant import Plant, joint_of
 from mpc_sgft.diagnose.record import Array, Episode, Index
-from mpc_sgft.diagnose.replay import AFTER, BEFORE, EITHER, Replayer
+from mpc_sgft.diagnose.replay import Replayer
 from mpc_sgft.diagnose.smooth import noise_of, smooth
 from mpc_sgft.diagnose.table import Scales
+from mpc_sgft.diagnose.windows import AFTER, BEFORE, EITHER
 from mpc_sgft.errors import UserError
 
 WINDOW = 1.0  # [s] where the data allow it

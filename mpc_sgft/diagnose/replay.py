@@ -10,16 +10,17 @@ import copy
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import mujoco
 import mujoco.rollout
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import lfilter
 
 from envs.effects import bend_bristles, bristles, place_rotors
 from envs.effects.base import ROTOR
+from mpc_sgft.diagnose import windows
+from mpc_sgft.diagnose.held import held_mean
 from mpc_sgft.diagnose.plant import Change, Plant
 from mpc_sgft.diagnose.record import Array, Episode, Index
 from mpc_sgft.diagnose.rub import Drive, rub
@@ -29,33 +30,8 @@ FULL = mujoco.mjtState.mjSTATE_FULLPHYSICS
 CTRL = int(mujoco.mjtState.mjSTATE_CTRL)
 FORCED = CTRL | int(mujoco.mjtState.mjSTATE_QFRC_APPLIED)
 THREADS = int(os.environ.get("OMP_NUM_THREADS", len(os.sched_getaffinity(0))))
-MIN_LAG = 1e-5  # [s] faster than this is no lag
-MOMENT = 1e-5  # [s]
-BEFORE, AFTER, EITHER = (-MOMENT, 0.0), (0.0, MOMENT), (-MOMENT, MOMENT)
 LEAD = 0.3  # [s] before a window, to find how rotors lean and bristles bend at its start
 EXPLODED = 1e6  # predictions are clipped here, so that an unstable candidate is bad, not infinite
-
-
-class Windows(NamedTuple):
-    """W windows of n + 1 samples.
-
-    Attributes:
-        episode: Index of each window's episode, [W].
-        start: Index of its first sample, [W].
-        samples: n, predicted samples after the start.
-        measured: Signals at these samples, [W, n, S].
-        q0, v0, a0: Measured start of each joint, [W, nj].
-        acting: From when to when after its tick the command acts whose force a sample shows [s], [W, n, 2].
-    """
-
-    episode: Index
-    start: Index
-    samples: int
-    measured: Array
-    q0: Array
-    v0: Array
-    a0: Array
-    acting: Array
 
 
 class Replayer:
@@ -75,10 +51,10 @@ class Replayer:
         leap = [int(getattr(mujoco.mjtIntegrator, f"mjINT_{k}")) for k in ("EULER", "IMPLICIT", "IMPLICITFAST")]
         self.half = self.h / 2 if plant.model.opt.integrator in leap else 0.0
         self.smooth = [smooth(e, plant.joints) for e in self.episodes]
-        self.windows = self._cut(max(2, round(window / self.dt)))
+        self.windows = windows.cut(self.episodes, self.smooth, self.signals, max(2, round(window / self.dt)))
         first = np.array([self.smooth[i].half for i in self.windows.episode], int)
         most = min(round(LEAD / self.dt), self.windows.samples)
-        self.ahead: Index | None = np.minimum(most, self.windows.start - first)  # samples that lead to each window
+        self.ahead = np.minimum(most, self.windows.start - first)  # samples that lead to each window
         self._nominal_ctrl: Array | None = None
         self.simulations = 0
 
@@ -121,10 +97,9 @@ class Replayer:
 
     def led(self) -> Replayer:
         """Windows that end, or come by, where these begin; as early as smoothing lets them, at most by LEAD."""
-        other, w = copy.copy(self), self.windows
-        assert self.ahead is not None
-        other.windows = self._windows(w.episode, w.start - self.ahead, int(self.ahead.max()))
-        other.ahead, other._nominal_ctrl = None, None
+        other, w, n = copy.copy(self), self.windows, int(self.ahead.max())
+        other.windows = windows.at(self.episodes, self.smooth, self.signals, w.episode, w.start - self.ahead, n)
+        other.ahead, other._nominal_ctrl = np.zeros_like(self.ahead), None
         return other
 
     def read(self, acting: tuple[float, float]) -> Replayer:
@@ -193,7 +168,7 @@ class Replayer:
             place_rotors(model, qpos, qvel, qacc)
             bend_bristles(model, qvel, act)
         rotors = [j for j in map(m.joint, range(m.njnt)) if j.name.startswith(ROTOR)]
-        if self.ahead is not None and (rotors or bristles(m)):
+        if self.ahead.any() and (rotors or bristles(m)):
             self._lead(models, changes, pick, state, rotors)
         return state, a
 
@@ -205,7 +180,6 @@ class Replayer:
         start, _ = before._begin(models, changes, pick, None)
         _, states, _ = before._advance(models, changes, pick, start, None)
         way = np.concatenate([start[:, :, None], states], 2)
-        assert self.ahead is not None
         then = np.round(self.ahead[pick] * self.dt / self.h).astype(int)
         end = way[:, np.arange(len(pick)), then]
         bent = 1 + m.nq + m.nv + m.actuator_actadr[bristles(m)]
@@ -356,35 +330,6 @@ class Replayer:
                 out[mine, :, a] = held_mean(ctrl[:, a], episode.dt, edges[mine] - late[a], lag[a])
         return out
 
-    def _cut(self, n: int) -> Windows:
-        episode, start = [], []
-        for i, e in enumerate(self.episodes):
-            first = np.arange(self.smooth[i].half, len(e.ctrl) - n, n)
-            episode += [i] * len(first)
-            start += list(first)
-        return self._windows(np.array(episode), np.array(start), n)
-
-    def _windows(self, episode: Index, start: Index, n: int) -> Windows:
-        """Windows of n samples after these starts."""
-        rows = [(i, np.arange(s + 1, s + n + 1)) for i, s in zip(episode, start, strict=True)]
-        measured = np.array([[self.episodes[i].signals[name][r] for name in self.signals] for i, r in rows])
-
-        def at_start(what: str) -> Array:
-            return np.array([getattr(self.smooth[i], what)[s] for i, s in zip(episode, start, strict=True)])
-
-        off = np.array([np.broadcast_to(self.episodes[i].off_tick, len(self.episodes[i].ctrl))[r] for i, r in rows])
-        known = np.isfinite(off)[..., None]
-        return Windows(
-            episode,
-            start,
-            n,
-            np.moveaxis(measured, 1, 2),
-            at_start("q"),
-            at_start("v"),
-            at_start("a"),
-            np.where(known, np.nan_to_num(off)[..., None] + AFTER, EITHER),
-        )
-
 
 def _alike(models: Sequence[mujoco.MjModel], changes: Sequence[Change]) -> list[list[int]]:
     """Indices of models of the same layout, all with loaded friction or none: these can be rolled out in one call."""
@@ -404,24 +349,3 @@ def _at(values: Array, position: NDArray[Any]) -> Array:
         return values[:, :, low[0]] * (1 - part) + values[:, :, low[0] + 1] * part
     rows = np.arange(len(values))[:, None]
     return np.moveaxis(values[rows, :, low], 2, 1) * (1 - part) + np.moveaxis(values[rows, :, low + 1], 2, 1) * part
-
-
-def held_mean(u: Array, dt: float, edges: Array, lag: float = 0.0) -> Array:
-    """Mean of a held command [T] over intervals [..., 2] of time since the first sample; constant beyond the ends.
-
-    Args:
-        u: The command.
-        dt: Seconds for which each is held.
-        edges: Beginning and end of the intervals [s].
-        lag: Time constant of a first-order low pass that it goes through, exactly [s].
-    """
-    total = np.concatenate([[0.0], np.cumsum(u)]) * dt
-    x = edges / dt
-    inside = np.interp(x, np.arange(len(total)), total)
-    inside = inside + np.minimum(x, 0) * u[0] * dt + np.maximum(x - len(u), 0) * u[-1] * dt
-    if lag > MIN_LAG:  # lag dy/dt = u - y
-        keep = np.exp(-dt / lag)
-        y, _ = lfilter([0.0, 1 - keep], [1.0, -keep], u, zi=[u[0]])  # at the samples
-        k = np.clip(np.floor(x), 0, len(u) - 1).astype(int)
-        inside = inside - lag * (u[k] + (y - u)[k] * np.exp(-np.maximum(edges - k * dt, 0) / lag))
-    return (inside[..., 1] - inside[..., 0]) / (edges[..., 1] - edges[..., 0])

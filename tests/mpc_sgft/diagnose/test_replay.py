@@ -8,14 +8,16 @@ import mujoco
 import numpy as np
 import pytest
 
+from mpc_sgft.diagnose.held import held_mean
 from mpc_sgft.diagnose.library import candidates, enrich, make_term
 from mpc_sgft.diagnose.plant import Change, Plant
 from mpc_sgft.diagnose.prepare import discrepancy, prepare, scales
 from mpc_sgft.diagnose.record import Episode
-from mpc_sgft.diagnose.replay import AFTER, BEFORE, Replayer, held_mean
+from mpc_sgft.diagnose.replay import Replayer
 from mpc_sgft.diagnose.rub import Drive
 from mpc_sgft.diagnose.smooth import smooth
 from mpc_sgft.diagnose.table import TABLE, Scales
+from mpc_sgft.diagnose.windows import AFTER, BEFORE
 from mpc_sgft.errors import UserError
 
 SLIDE = """<mujoco><option timestep="0.002"/><worldbody><body name="cart"><joint name="x" type="slide" axis="1 0 0"/>
@@ -302,20 +304,25 @@ def test_a_position_is_as_uncertain_as_its_smoothing_bends_it() -> None:
     assert (off < 3).mean() > 0.97 and off.max() < 10, (np.mean(off < 3), off.max())
 
 
-def test_rotors_come_to_the_window_as_the_motion_before_left_them() -> None:
-    """Within the play nothing pushes the joint, so that its acceleration does not tell where the rotor is."""
-    plant = Plant(mujoco.MjSpec.from_string(SLIDE.replace('axis="1 0 0"/>', 'axis="1 0 0" armature="0.5"/>')))
-    play = make_term(plant, "backlash", "x", Scales()).build(np.array([0.02]))
-    m, u = plant.compile(play), 4 * np.cos(3 * 0.002 * np.arange(3000))
-    data, q = mujoco.MjData(m), []
+def _window_errors(plant: Plant, change: Change, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Errors at the ends of windows of a motion that this change made, [W]: led to each window, and not."""
+    m, q = plant.compile(change), []
+    data = mujoco.MjData(m)
     for command in u:
         q.append(data.qpos[0])
         data.ctrl[0] = command
         mujoco.mj_step(m, data)
-    replayer = Replayer(plant, [Episode("play", 0.002, u[:, None], {"qpos/x": np.array(q)})], 0.3, ["qpos/x"])
-    led = np.abs(replayer.simulate([play])[0] - replayer.windows.measured)[1:, -1, 0]
-    replayer.ahead = None
-    guessed = np.abs(replayer.simulate([play])[0] - replayer.windows.measured)[1:, -1, 0]
+    replayer = Replayer(plant, [Episode("a", 0.002, u[:, None], {"qpos/x": np.array(q)})], 0.3, ["qpos/x"])
+    led = np.abs(replayer.simulate([change])[0] - replayer.windows.measured)[1:, -1, 0]
+    replayer.ahead = np.zeros_like(replayer.ahead)
+    return led, np.abs(replayer.simulate([change])[0] - replayer.windows.measured)[1:, -1, 0]
+
+
+def test_rotors_come_to_the_window_as_the_motion_before_left_them() -> None:
+    """Within the play nothing pushes the joint, so that its acceleration does not tell where the rotor is."""
+    plant = Plant(mujoco.MjSpec.from_string(SLIDE.replace('axis="1 0 0"/>', 'axis="1 0 0" armature="0.5"/>')))
+    play = make_term(plant, "backlash", "x", Scales()).build(np.array([0.02]))
+    led, guessed = _window_errors(plant, play, 4 * np.cos(3 * 0.002 * np.arange(3000)))
     assert (guessed > 3e-3).sum() > 2 > (led > 2e-3).sum() and led.mean() < 0.4 * guessed.mean()
 
 
@@ -323,14 +330,22 @@ def test_bristles_come_to_the_window_as_the_motion_before_bent_them(plant) -> No
     """Where a joint hardly moves, its speed does not tell how far its bristles are bent."""
     numbers = np.array([1.0, 0.5, 0.05, 0.01, 0.3])  # coulomb, excess, velocity, deflection, damping ratio
     lugre = make_term(plant, "stribeck_friction", "x", Scales()).build(numbers)
-    m, u = plant.compile(lugre), 2 * np.cos(3 * 0.002 * np.arange(3000))
-    data, q = mujoco.MjData(m), []
+    led, guessed = _window_errors(plant, lugre, 2 * np.cos(3 * 0.002 * np.arange(3000)))
+    assert np.median(led) < 1e-3 and led.mean() < 0.4 * guessed.mean()
+
+
+def test_a_saturation_starts_near_what_the_motion_needs_however_much_was_asked() -> None:
+    """A servo that is asked for 60 N all the time and gives 0.6: a hundredth, below all fixed starts."""
+    scene = SLIDE.replace('<motor name="motor" joint="x"/>', '<position name="motor" joint="x" kp="60" kv="1"{}/>')
+    limited = mujoco.MjModel.from_xml_string(scene.format(' forcerange="-0.6 0.6"'))
+    data, q = mujoco.MjData(limited), []
+    u = np.sign(np.sin(2 * 0.002 * np.arange(3000)))
     for command in u:
         q.append(data.qpos[0])
         data.ctrl[0] = command
-        mujoco.mj_step(m, data)
-    replayer = Replayer(plant, [Episode("dry", 0.002, u[:, None], {"qpos/x": np.array(q)})], 0.3, ["qpos/x"])
-    led = np.abs(replayer.simulate([lugre])[0] - replayer.windows.measured)[1:, -1, 0]
-    replayer.ahead = None
-    guessed = np.abs(replayer.simulate([lugre])[0] - replayer.windows.measured)[1:, -1, 0]
-    assert np.median(led) < 1e-3 and led.mean() < 0.4 * guessed.mean()
+        mujoco.mj_step(limited, data)
+    plant = Plant(mujoco.MjSpec.from_string(scene.format("")))
+    sizes = scales(plant, Replayer(plant, [Episode("a", 0.002, u[:, None], {"qpos/x": np.array(q)})], 0.5, ["qpos/x"]))
+    term = make_term(plant, "torque_saturation", "motor", sizes["actuator", "motor"])
+    assert sizes["actuator", "motor"].peak > 50
+    assert min(abs(np.log(float(s[0]) / 0.6)) for s in term.starts) < np.log(1.5), term.starts

@@ -57,3 +57,13 @@ def test_generate_run_score_and_resume(
 def test_errors_are_one_line_and_exit_2(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert blind_benchmark.main(["--seed", "4", "--out", str(tmp_path), "--only", "score"]) == 2
     assert "run with --only generate first" in capsys.readouterr().err
+
+
+def test_cases_do_not_depend_on_the_number_of_processes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def few(seed: int, count: int, least_none: int = 0) -> list[drawing.Case]:
+        short = [c for c in drawing.draw(seed, 300) if c.group == "none" and c.seconds == 2.0]
+        return [next(c for c in short if c.plant == plant) for plant in ("pendulum", "slide")]
+
+    monkeypatch.setattr(blind_benchmark, "draw", few)
+    first, second = (blind_benchmark.generate(tmp_path / str(n), 4, 2, 0, jobs=n) for n in (1, 2))
+    assert first == second
