@@ -114,7 +114,7 @@ class Problem:
         sensitivity: Derivative of the predictions by the start, [W, n, S, 2 nj].
 
     Attributes:
-        floor_share: Of each residual's expected square, how much is the simulator's, 0…1, [W, m].
+        floor_shares: Of each residual's expected square, how much each term of the floor makes, 0…1, [F, W, m].
     """
 
     step, pattern = STEP, ()
@@ -126,9 +126,10 @@ class Problem:
         self.blocks = n // self.stride
         self.target = self._average(replayer.windows.measured - own.known)
         noise = sigma / np.sqrt(self.stride)
-        floor = np.minimum((self._average(own.floor) ** 2).sum(0), (MOST_FLOOR * noise) ** 2)
-        self.scale = np.sqrt(noise**2 + floor + self._average(own.doubt) ** 2)
-        self.floor_share = (floor / self.scale**2).reshape(len(self.scale), -1)
+        floors = self._average(own.floor) ** 2
+        floors *= np.minimum(1.0, (MOST_FLOOR * noise) ** 2 / np.maximum(floors.sum(0), 1e-300))
+        self.scale = np.sqrt(noise**2 + floors.sum(0) + self._average(own.doubt) ** 2)
+        self.floor_shares = (floors / self.scale**2).reshape(len(floors), len(self.scale), self.scale[0].size)
         moved = self._average(np.moveaxis(sensitivity, -1, 0)) / self.scale  # [2 nj, W, nb, S]
         a = moved.reshape(*moved.shape[:2], -1).transpose(1, 2, 0) * start_sd[:, None]  # [W, m, 2 nj]
         self.u, s, _ = np.linalg.svd(a, full_matrices=False)

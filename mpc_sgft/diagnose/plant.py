@@ -14,7 +14,7 @@ from envs.effects.passive import stiffen_dry_friction
 from mpc_sgft.diagnose.record import Array, Index
 from mpc_sgft.errors import UserError
 
-SHARP = 5e-4  # [s] longest step of a fit
+SHARP = 5e-4  # [s] longest step of a fit that is judged
 FORCE = "diagnose/force/"  # sensors that are added for the comparison
 SCALAR = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
 
@@ -116,14 +116,14 @@ class Plant:
             name: tuple(m.jnt_range[i]) if m.jnt_limited[i] else (-np.inf, np.inf) for i, name in enumerate(self.joints)
         }
 
-    def sharper(self) -> Plant:
-        """The same scene in shorter steps, with joint friction as dry as these allow.
+    def sharper(self, longest: float = SHARP) -> Plant:
+        """The same scene in steps no longer than this [s], with joint friction as dry as these allow.
 
         MuJoCo's friction of a joint is viscous below a speed that its solref sets, at least twice the step. That is the
         simulator's own error wherever a motion reverses, and larger than an encoder's noise at the usual steps of 2 ms.
         """
         spec = self.spec.copy()
-        spec.option.timestep /= max(1, np.ceil(spec.option.timestep / SHARP - 1e-9))
+        spec.option.timestep /= max(1, np.ceil(spec.option.timestep / longest - 1e-9))
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
         spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_ISLAND)  # a few joints need none
         for joint in spec.joints:

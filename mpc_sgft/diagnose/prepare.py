@@ -45,6 +45,7 @@ class Setup(Generic[P]):
         noise, floor: Of each signal, of the sensor and of the simulator (its median), [S].
         quiet: An error below which nothing is left to explain.
         parts: Into which each window is cut when sets are compared; a few long windows say more than many short ones.
+        stepping: Share of the expected squared error that the simulator's time step makes.
         judged: What of a window's error counts when sets are compared; the error itself by default.
     """
 
@@ -58,6 +59,7 @@ class Setup(Generic[P]):
     judged: Callable[[Array], Array] = field(default=np.asarray)
     quiet: float = -np.inf
     parts: int = 1
+    stepping: float = 0.0
 
     def one_window(self, errors: Array) -> bool:
         """Whether several parts of one window may show an effect: where windows are few, and noise alone is left.
@@ -110,30 +112,37 @@ def prepare(
     return _setup(replayer, noise, fitted, held, base, nominal)
 
 
-def around(setup: Setup[Problem], f: Fit) -> Setup[Problem]:
+def around(setup: Setup[Problem], f: Fit, plant: Plant) -> Setup[Problem]:
     """The same windows, with what errors of a start and of the simulator's steps do to a fit, not to the nominal model.
 
     Where a joint sticks, for one, it no longer matters how fast it was taken to be.
+
+    Args:
+        setup: Of the nominal model.
+        f: The fit.
+        plant: The scene in other steps.
     """
-    return _setup(setup.problem.replayer, setup.noise, setup.fitted, setup.held, f, setup.baseline.terms)
+    replayer = setup.problem.replayer.of(plant)
+    return _setup(replayer, setup.noise, setup.fitted, setup.held, f, setup.baseline.terms)
 
 
 def _setup(
     replayer: Replayer, noise: Array, fitted: Index, held: Index, near: Fit, nominal: Sequence[Term]
 ) -> Setup[Problem]:
     """A problem that is right near a fit, whose first terms are the nominal ones, and its baseline."""
-    own = discrepancy(replayer.plant, replayer.episodes, replayer, near.terms, near.values)
+    own = discrepancy(replayer, near.terms, near.values)
     problem = _problem(replayer, noise, own, near.terms, near.values)
     base = fit(problem, nominal, near.values[: len(nominal)], fitted)
     parts = max(1, -(-UNITS // len(replayer.windows.start)))
     blocks = cut(len(fitted))
-    least = by_parts(problem.floor_share[np.concatenate([fitted, held])], parts)  # less says nothing of the machine
+    share = problem.floor_shares.sum(0)[np.concatenate([fitted, held])]
+    least = by_parts(share, parts)  # less says nothing of the machine
 
     def judged(errors: Array) -> Array:
         return np.log1p(np.maximum(errors, least))
 
-    floor = np.median(own.floor[0], (0, 1))
-    return Setup(problem, fitted, held, blocks, base, noise, floor, judged, NOISE + QUIET, parts)
+    floor, stepping = np.median(own.floor[0], (0, 1)), float(problem.floor_shares[0].mean())
+    return Setup(problem, fitted, held, blocks, base, noise, floor, judged, NOISE + QUIET, parts, stepping)
 
 
 def cut(fitted: int) -> Index:
@@ -174,9 +183,7 @@ def split(replayer: Any, held_out: float | Sequence[str] | None) -> tuple[Index,
     return everything[~apart], everything[apart]
 
 
-def discrepancy(
-    plant: Plant, episodes: Sequence[Episode], replayer: Replayer, terms: Sequence[Term], values: Sequence[Array]
-) -> Discrepancy:
+def discrepancy(replayer: Replayer, terms: Sequence[Term], values: Sequence[Array]) -> Discrepancy:
     """How far predictions are off although the model is right.
 
     By the simulator's time step: what steps a quarter as long change is taken off; what is left of a second-order error
@@ -184,13 +191,13 @@ def discrepancy(
     reverses. What is off once in a window is taken to stay off. By the clock: a force follows its command at once, and
     may always have been read before that changed, not after; where nobody knows, now the one and now the other.
     """
-    w, change = replayer.windows, change_of(terms, values)
+    plant, w, change = replayer.plant, replayer.windows, change_of(terms, values)
 
     def simulate(share: int) -> Array:
         """In steps of this share."""
         spec = plant.spec.copy()
         spec.option.timestep = plant.model.opt.timestep / share
-        return Replayer(Plant(spec), episodes, w.samples * replayer.dt, replayer.signals).simulate([change])[0]
+        return replayer.of(Plant(spec)).simulate([change])[0]
 
     predicted, half, quarter = replayer.simulate([change])[0], simulate(2), simulate(4)
     step = np.maximum.accumulate(np.abs(quarter - half), 1)

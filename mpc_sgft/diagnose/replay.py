@@ -47,9 +47,6 @@ class Replayer:
     def __init__(self, plant: Plant, episodes: Sequence[Episode], window: float, signals: Sequence[str]):
         self.plant, self.episodes, self.signals = plant, list(episodes), list(signals)
         self.dt = episodes[0].dt
-        self.h = float(plant.model.opt.timestep)
-        leap = [int(getattr(mujoco.mjtIntegrator, f"mjINT_{k}")) for k in ("EULER", "IMPLICIT", "IMPLICITFAST")]
-        self.half = self.h / 2 if plant.model.opt.integrator in leap else 0.0
         self.smooth = [smooth(e, plant.joints) for e in self.episodes]
         self.windows = windows.cut(self.episodes, self.smooth, self.signals, max(2, round(window / self.dt)))
         first = np.array([self.smooth[i].half for i in self.windows.episode], int)
@@ -57,6 +54,17 @@ class Replayer:
         self.ahead = np.minimum(most, self.windows.start - first)  # samples that lead to each window
         self._nominal_ctrl: Array | None = None
         self.simulations = 0
+
+    @property
+    def h(self) -> float:
+        """Physics step [s]."""
+        return float(self.plant.model.opt.timestep)
+
+    @property
+    def half(self) -> float:
+        """By how much velocities live before positions [s]."""
+        leap = [int(getattr(mujoco.mjtIntegrator, f"mjINT_{k}")) for k in ("EULER", "IMPLICIT", "IMPLICITFAST")]
+        return self.h / 2 if self.plant.model.opt.integrator in leap else 0.0
 
     def simulate(
         self,
@@ -87,6 +95,12 @@ class Replayer:
             )
         self.simulations += len(changes) * len(pick)
         return np.clip(np.nan_to_num(out, nan=EXPLODED), -EXPLODED, EXPLODED)
+
+    def of(self, plant: Plant) -> Replayer:
+        """The same windows of another model of the scene."""
+        other = copy.copy(self)
+        other.plant, other._nominal_ctrl = plant, None
+        return other
 
     def with_commands(self, change: Callable[[Array], Array]) -> Replayer:
         """The same starts under other commands: f(ctrl [T, nu]) -> [T, nu] of every episode."""

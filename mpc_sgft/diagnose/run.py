@@ -21,7 +21,7 @@ from mpc_sgft.diagnose.locate import locate
 from mpc_sgft.diagnose.name import Verdict, effect_probability, intervals, judge_entries, settled
 from mpc_sgft.diagnose.name import choose as choose_set
 from mpc_sgft.diagnose.nominal import nominal_terms, refit_table
-from mpc_sgft.diagnose.plant import Change, Plant
+from mpc_sgft.diagnose.plant import SHARP, Change, Plant
 from mpc_sgft.diagnose.prepare import Setup, around, prepare, scales
 from mpc_sgft.diagnose.record import Array, Episode, files, read_table
 from mpc_sgft.diagnose.replay import Replayer
@@ -30,6 +30,9 @@ from mpc_sgft.diagnose.search import again, search
 from mpc_sgft.diagnose.table import TABLE
 from mpc_sgft.errors import UserError
 from mpc_sgft.log import progress as bar_of
+
+STEPS = (4 * SHARP, 2 * SHARP, SHARP)  # [s] to search with: the longest whose error noise hides
+UNSEEN = 0.2  # share of the expected squared error that noise hides
 
 
 def read(plant: Plant, data: Sequence[str | Path]) -> list[Episode]:
@@ -65,8 +68,12 @@ def run(
     if max_effects < 1:
         raise UserError(f"max_effects={max_effects}: at least one effect must be allowed.")
     began, rng = time.perf_counter(), np.random.default_rng(seed)
+    nominal = nominal_terms(plant, uncertain)
+    for step in sorted({min(step, recorded[0].dt) for step in STEPS}, reverse=True):
+        setup = prepare(plant.sharper(step), recorded, nominal, window=window, signals=signals, held_out=held_out)
+        if setup.stepping < UNSEEN:
+            break
     sharp = plant.sharper()
-    setup = prepare(sharp, recorded, nominal_terms(plant, uncertain), window=window, signals=signals, held_out=held_out)
     sizes = scales(sharp, setup.problem.replayer)
     with bar_of(100, desc="diagnose", unit="%", disable=not progress) as bar:
 
@@ -78,7 +85,7 @@ def run(
         entries = search(setup, terms, max_effects, rng, show)
         best = choose_set(setup, entries, rng)
         if best.effects:  # windows began as the nominal model sees it: look again as this set does
-            was, setup = best.error, around(setup, best.fit)
+            was, setup = best.error, around(setup, best.fit, sharp)
             entries = again(setup, entries, best)
             best = choose_set(setup, entries, rng)
             if not settled(best) and was - best.error > judge.worth(was):

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from mpc_sgft.diagnose import diagnose
+from mpc_sgft.diagnose import run as running
 from mpc_sgft.diagnose import search as searching
 from mpc_sgft.diagnose.check import episodes
 from mpc_sgft.diagnose.entry import Entry, entry
@@ -34,7 +37,7 @@ def _fit(setup: Setup[Problem], plant: Plant, *sizes: tuple[str, float]) -> Entr
 def test_near_the_right_fit_noise_alone_is_left(dry) -> None:
     plant, setup = dry
     far = _fit(setup, plant, ("coulomb_friction", 15.0))
-    near = _fit(around(setup, far.fit), plant, ("coulomb_friction", 15.0))
+    near = _fit(around(setup, far.fit, plant), plant, ("coulomb_friction", 15.0))
     squares = [float((e.fit.r**2).mean()) for e in (far, near)]
     assert 0.8 < squares[1] < 1.15 < 1.8 < squares[0], squares
 
@@ -44,5 +47,27 @@ def test_judging_again_keeps_the_parts_of_a_set_however_bad_they_are(dry, monkey
     plant, setup = dry
     singles = [_fit(setup, plant, (n, 0.1)) for n in ("coulomb_friction", "viscous_friction", "quadratic_drag")]
     pair = _fit(setup, plant, ("viscous_friction", 0.1), ("coulomb_friction", 15.0))
-    judged = searching.again(around(setup, pair.fit), [entry(setup, setup.baseline), *singles, pair], pair)
+    judged = searching.again(around(setup, pair.fit, plant), [entry(setup, setup.baseline), *singles, pair], pair)
     assert not judged[0].effects and {e.key for e in judged[1:]} == {pair.key, singles[0].key, singles[1].key}
+
+
+@pytest.mark.parametrize(("noise", "searched"), [(5e-4, 2e-3), (1e-7, 5e-4)])
+def test_long_steps_search_where_noise_hides_their_error_and_short_ones_judge(
+    noise: float, searched: float, slide: Path, record, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    steps: dict[str, list[float]] = {"search": [], "again": []}
+
+    def watch(name: str) -> Callable[..., list[Entry]]:
+        inner = getattr(running, name)
+
+        def watched(setup: Setup[Problem], *rest: object) -> list[Entry]:
+            steps[name].append(setup.problem.replayer.h)
+            return inner(setup, *rest)
+
+        return watched
+
+    for name in steps:
+        monkeypatch.setattr(running, name, watch(name))
+    report = diagnose(slide, [record(seconds=8.0, viscous=2.0, noise=noise)], effects=["viscous_friction"])
+    assert report.as_dict()["verdict"] == "effect"
+    assert steps["search"][0] == pytest.approx(searched) and steps["again"] == pytest.approx([5e-4])

@@ -50,7 +50,7 @@ def test_what_shorter_steps_would_change_is_known() -> None:
     episode = replace(_sine(), ctrl=3 * np.cos(9 * 0.001 * np.arange(2000))[:, None])
     coarse, true = (Replayer(p, [episode], 0.5, ["qpos/x"]) for p in (plant, Plant(fine)))
     off = coarse.simulate([Change()])[0] - true.simulate([Change()])[0]
-    known, floor, _ = discrepancy(plant, [episode], coarse, [], [])
+    known, floor, _ = discrepancy(coarse, [], [])
     assert np.abs(off + known).max() < 0.3 * np.abs(off).max()
     assert (np.abs(off + known) <= floor[0] + 1e-12).mean() > 0.95
 
@@ -155,7 +155,7 @@ def test_a_force_may_have_been_read_before_its_command(servo, unsure: bool) -> N
     plant, episode, _ = servo
     episode = replace(episode, off_tick=np.nan if unsure else 0.0)
     replayer = Replayer(plant, [episode], 0.4, ["qpos/x", "force/servo"])
-    _, floor, doubt = discrepancy(plant, [episode], replayer, [], [])
+    _, floor, doubt = discrepancy(replayer, [], [])
     w, jump = replayer.windows, 4000.0 * np.diff(episode.ctrl[:, 0], prepend=0.0)
     jumps = np.array([jump[s + 1 : s + 1 + w.samples] for s in w.start])
     often, always = (np.abs(jumps) / 2, 0 * jumps) if unsure else (0 * jumps, jumps)
