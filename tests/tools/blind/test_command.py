@@ -1,6 +1,7 @@
 """The command generates, runs a solver and scores; a made-up solver stands in for diagnose."""
 
 import json
+import shutil
 import sys
 import types
 from pathlib import Path
@@ -40,7 +41,8 @@ def test_generate_run_score_and_resume(
         return [c for c in drawing.draw(seed, 300) if c.plant == "slide" and c.group == "none"][:count]
 
     monkeypatch.setattr(blind_benchmark, "draw", few)
-    line = ["--seed", "4", "--cases", "2", "--out", str(tmp_path / "b"), "--jobs", "1", "--no-baselines"]
+    kept = ["--pack", str(tmp_path / "reports.jsonl.gz")]
+    line = ["--seed", "4", "--cases", "2", "--out", str(tmp_path / "b"), "--jobs", "1", "--no-baselines", *kept]
     assert blind_benchmark.main(line) == 0
     printed = capsys.readouterr().out
     assert (tmp_path / "b/labels.sha256").read_text().strip() in printed
@@ -52,6 +54,11 @@ def test_generate_run_score_and_resume(
         assert (tmp_path / "b" / name).stat().st_size > 0
     assert blind_benchmark.main(line) == 0
     assert len(solver) == 2  # nothing is run twice
+    shutil.rmtree(tmp_path / "b")
+    assert blind_benchmark.main(line) == 0 and len(solver) == 2  # nor anywhere else
+    assert "2 reports taken over" in capsys.readouterr().out
+    assert blind_benchmark.main(["--seed", "5", "--cases", "2", "--out", str(tmp_path / "c"), *line[6:]]) == 2
+    assert "holds reports on cases of seed 4" in capsys.readouterr().err and len(solver) == 2
 
 
 def test_errors_are_one_line_and_exit_2(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
