@@ -22,7 +22,7 @@ from mpc_sgft.errors import UserError
 WINDOW = 1.0  # [s] where the data allow it
 MIN_WINDOWS = 4  # shorter windows rather than fewer
 UNITS = 24  # parts of windows to compare sets on, at least
-FEW_WINDOWS = 7  # fewer: one may hold all that shows an effect
+FEW_WINDOWS = 12  # fewer: one may hold all that shows an effect
 BLOCKS = 8  # into which the fitted windows are split for leaving out
 NOISE = float(np.log(2.0))  # log(1 + e) of a window whose error is noise alone, e = 1
 QUIET = 0.05  # in log(1 + e): below this above the noise's, no further effect is searched for

@@ -26,7 +26,7 @@ from mpc_sgft.diagnose.prepare import Setup, around, prepare, scales
 from mpc_sgft.diagnose.record import Array, Episode, files, read_table
 from mpc_sgft.diagnose.replay import Replayer
 from mpc_sgft.diagnose.report import MAX_CANDIDATES, Report
-from mpc_sgft.diagnose.search import again, search
+from mpc_sgft.diagnose.search import again, nearest, search
 from mpc_sgft.diagnose.table import TABLE
 from mpc_sgft.errors import UserError
 from mpc_sgft.log import progress as bar_of
@@ -84,9 +84,10 @@ def run(
         terms = candidates(sharp, sizes, effects)
         entries = search(setup, terms, max_effects, rng, show)
         best = choose_set(setup, entries, rng)
-        if best.effects:  # windows began as the nominal model sees it: look again as this set does
-            was, setup = best.error, around(setup, best.fit, sharp)
-            entries = again(setup, entries, best)
+        near = best if best.effects else nearest(entries)
+        if near.effects:  # windows began as the nominal model sees it: look again as this set does
+            was, setup = near.error, around(setup, near.fit, sharp)
+            entries = again(setup, entries, near)
             best = choose_set(setup, entries, rng)
             if not settled(best) and was - best.error > judge.worth(was):
                 entries = search(setup, terms, max_effects, rng, show)

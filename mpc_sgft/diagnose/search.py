@@ -74,6 +74,17 @@ def search(
     return list((found | swaps(setup, found, terms, effort)).values())
 
 
+def nearest(entries: Sequence[Entry]) -> Entry:
+    """The set that comes nearest to the fitted data, if that is worth a name; else the baseline.
+
+    Args:
+        entries: As from `search`, baseline first.
+    """
+    best = min(entries, key=lambda e: float(e.fitted.mean()))
+    before = float(entries[0].fitted.mean())
+    return best if before - float(best.fitted.mean()) > judge.worth(before) else entries[0]
+
+
 def again(setup: Setup[Any], entries: Sequence[Entry], best: Entry) -> list[Entry]:
     """The best sets, those that are in them, and the baseline, fitted and judged anew for another setup.
 

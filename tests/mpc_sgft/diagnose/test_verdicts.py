@@ -17,6 +17,9 @@ SANDER = """<mujoco><option timestep="0.002"/><worldbody><geom name="table" type
 <body name="block" pos="0 0 0.05"><joint name="x" type="slide" axis="1 0 0"/><joint name="z" type="slide" axis="0 0 1"/>
 <geom name="foot" type="box" size="0.05 0.05 0.05" mass="2" friction="0.6"/></body></worldbody>
 <actuator><motor name="pull" joint="x" gear="10"/><motor name="press" joint="z" gear="10"/></actuator></mujoco>"""
+SERVO = """<mujoco><option timestep="0.002"/><worldbody><body name="arm"><joint name="hinge" axis="0 -1 0"/>
+<inertial pos="0 0 -0.2" mass="1" diaginertia="0.02 0.02 0.001"/></body></worldbody>
+<actuator><position name="servo" joint="hinge" kp="47" kv="2.9" {}/></actuator></mujoco>"""
 FEW = ["viscous_friction", "coulomb_friction", "quadratic_drag", "actuator_delay", "actuator_offset"]
 
 
@@ -75,3 +78,23 @@ def test_a_surface_that_is_slipperier_is_told_from_a_dry_joint_by_pressing(tmp_p
     assert [e["name"] for e in report["effects"]] == ["contact_friction"] and report["effects"][0]["at"] == ["foot"]
     assert abs(report["effects"][0]["parameters"]["coefficient"]["value"] - 0.3) < 0.003
     assert report["held_out"]["low"] > 0.9
+
+
+def test_a_servo_that_saturates_once_is_found(tmp_path: Path) -> None:
+    """One window of eight shows it, where a saturated servo keeps an error of the start that a stiff one forgets."""
+    model = mujoco.MjModel.from_xml_string(SERVO.format('forcerange="-0.5 0.5"'))
+    model.opt.timestep, model.opt.integrator = 2e-4, int(mujoco.mjtIntegrator.mjINT_RK4)
+    data, dt, rng = mujoco.MjData(model), 0.002, np.random.default_rng(0)
+    t = np.arange(4000) * dt
+    u = 0.08 * np.sin(2 * t) + 0.45 * np.exp(-(((t - 3.35) / 0.2) ** 2))
+    q = []
+    for command in u:
+        q.append(data.qpos[0] + 2e-5 * rng.standard_normal())
+        data.ctrl[:] = command
+        mujoco.mj_step(model, data, round(dt / model.opt.timestep))
+    (tmp_path / "servo.xml").write_text(SERVO.format(""))
+    write_csv(tmp_path / "servo.csv", {"time": t, "ctrl/servo": u, "qpos/hinge": np.array(q)})
+    few = ["torque_saturation", "viscous_friction"]
+    report = diagnose(tmp_path / "servo.xml", [tmp_path / "servo.csv"], effects=few).as_dict()
+    assert [e["name"] for e in report["effects"]] == ["torque_saturation"], report["reason"]
+    assert abs(report["effects"][0]["parameters"]["limit"]["value"] - 0.5) < 0.005
