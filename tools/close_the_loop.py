@@ -1,6 +1,6 @@
 """Deploy into a gap, name it, repair the simulator, pretrain on in it and deploy again; one CSV row each gap and seed.
 
-    python -m tools.close_the_loop results/close_the_loop.csv --gaps turned sluggish glide --seeds 0 1 2
+    python -m tools.close_the_loop results/close_the_loop.csv --gaps turned sluggish skate --seeds 0 1 2
     python -m tools.close_the_loop small.csv --gaps dev_turned --seeds 0 --transitions 5000 --set rollouts=4
 
 Each gap and seed has a folder under --runs; a first deployment or a comparison that is there is not made again. The gap
@@ -34,7 +34,7 @@ COLUMNS = [
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("csv", type=Path)
-    parser.add_argument("--gaps", nargs="+", default=["turned", "sluggish", "glide"])
+    parser.add_argument("--gaps", nargs="+", default=["turned", "sluggish", "skate"])
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
     parser.add_argument("--transitions", type=int, default=60_000)
     parser.add_argument("--set", nargs="*", default=[], metavar="name=value", help="overrides of the deployments")
