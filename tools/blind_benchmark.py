@@ -1,14 +1,14 @@
 """The blind benchmark of `diagnose`: make cases from a seed, hide the labels, run, score, draw.
 
     python -m tools.blind_benchmark --seed 20261 --cases 300 --out runs/blind [--jobs 2] [--csv results/blind.csv]
-                                    [--only generate|run|score] [--least-none 100] [--fr3 30] [--no-oracle]
+                                    [--only generate|run|score|pack] [--least-none 100] [--fr3 30] [--no-oracle]
                                     [--no-baselines] [--pack results/blind_reports.jsonl.gz]
 
 The labels' SHA-256 is printed before the solver starts, and checked before scoring. A seed that was used to tune the
 solver must not be reported: 11, 901 to 905 and 20261121 to 20261124 so far.
 Everything is resumable: what is on disk is not done again, nor what --pack holds, a file of all reports that is read
-before the solver starts and written when it ends or is interrupted. The CSV has one row a score; beside it go
-<csv>_cases.csv with one row a case, <csv>_confusion.png and <csv>_power.png.
+before the solver starts and written when it ends, or at once with --only pack, also while it runs. The CSV has one
+row a score; beside it go <csv>_cases.csv with one row a case, <csv>_confusion.png and <csv>_power.png.
 """
 
 import argparse
@@ -158,7 +158,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--fr3", type=int, default=0, help="so many cases of the FR3 beside the others (default 0)")
     parser.add_argument("--out", type=Path, required=True, help="folder for cases, labels and reports")
     parser.add_argument("--jobs", type=int, default=2, help="processes (default 2)")
-    parser.add_argument("--only", choices=STEPS, help="one step (default: all)")
+    parser.add_argument("--only", choices=(*STEPS, "pack"), help="one step (default: all)")
     parser.add_argument("--csv", type=Path, help="scores (default OUT/scores.csv)")
     parser.add_argument("--pack", type=Path, help="file of all reports, to go on with them elsewhere")
     parser.add_argument("--no-oracle", action="store_true", help="leave out the runs that know the true names")
@@ -173,16 +173,16 @@ def main(argv: list[str]) -> int:
         if cases.seed_of(args.out) != args.seed:
             raise ValueError(f"{args.out} holds cases of seed {cases.seed_of(args.out)}, not of {args.seed}")
         print("labels SHA-256", (args.out / "labels.sha256").read_text().strip(), flush=True)
+        if args.only == "pack" and not args.pack:
+            raise ValueError("--only pack needs the file: --pack results/blind_reports.jsonl.gz")
         if args.pack and args.pack.is_file():
             print(f"{unpack(args.pack, args.out)} reports taken over from {args.pack}", flush=True)
         if "run" in steps:
-            try:
-                run(args.out, args.jobs)
-                if not args.no_oracle:
-                    run_oracle(args.out, args.jobs)
-            finally:
-                if args.pack:
-                    print(f"{pack(args.out, args.pack)} reports in {args.pack}", flush=True)
+            run(args.out, args.jobs)
+            if not args.no_oracle:
+                run_oracle(args.out, args.jobs)
+        if args.pack and {"run", "pack"} & {*steps}:
+            print(f"{pack(args.out, args.pack)} reports in {args.pack}", flush=True)
         if "score" in steps:
             compared = {} if args.no_baselines else run_baselines(args.out, args.jobs)
             write_scores(args.out, args.csv or args.out / "scores.csv", compared, args.seed)

@@ -41,8 +41,9 @@ def test_generate_run_score_and_resume(
         return [c for c in drawing.draw(seed, 300) if c.plant == "slide" and c.group == "none"][:count]
 
     monkeypatch.setattr(blind_benchmark, "draw", few)
-    kept = ["--pack", str(tmp_path / "reports.jsonl.gz")]
-    line = ["--seed", "4", "--cases", "2", "--out", str(tmp_path / "b"), "--jobs", "1", "--no-baselines", *kept]
+    kept = tmp_path / "reports.jsonl.gz"
+    how = ["--jobs", "1", "--no-baselines", "--pack", str(kept)]
+    line = ["--seed", "4", "--cases", "2", "--out", str(tmp_path / "b"), *how]
     assert blind_benchmark.main(line) == 0
     printed = capsys.readouterr().out
     assert (tmp_path / "b/labels.sha256").read_text().strip() in printed
@@ -54,15 +55,19 @@ def test_generate_run_score_and_resume(
         assert (tmp_path / "b" / name).stat().st_size > 0
     assert blind_benchmark.main(line) == 0
     assert len(solver) == 2  # nothing is run twice
+    kept.unlink()
+    assert blind_benchmark.main([*line, "--only", "pack"]) == 0 and kept.is_file()
     shutil.rmtree(tmp_path / "b")
     assert blind_benchmark.main(line) == 0 and len(solver) == 2  # nor anywhere else
     assert "2 reports taken over" in capsys.readouterr().out
-    assert blind_benchmark.main(["--seed", "5", "--cases", "2", "--out", str(tmp_path / "c"), *line[6:]]) == 2
+    assert blind_benchmark.main(["--seed", "5", "--cases", "2", "--out", str(tmp_path / "c"), *how]) == 2
     assert "holds reports on cases of seed 4" in capsys.readouterr().err and len(solver) == 2
 
 
 def test_errors_are_one_line_and_exit_2(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert blind_benchmark.main(["--seed", "4", "--out", str(tmp_path), "--only", "score"]) == 2
+    assert "run with --only generate first" in capsys.readouterr().err
+    assert blind_benchmark.main(["--seed", "4", "--out", str(tmp_path), "--only", "pack"]) == 2
     assert "run with --only generate first" in capsys.readouterr().err
 
 
