@@ -10,7 +10,6 @@ from tools import time_diagnose
 
 def test_rows_and_ratios(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(time_diagnose, "PARTS", (2,))
-    monkeypatch.setattr(time_diagnose, "TABLE", ["viscous_friction", "coulomb_friction"])
     monkeypatch.setattr("sys.argv", ["time_diagnose", "--quick", "--out", str(tmp_path / "t.csv")])
     time_diagnose.main()
     rows = list(csv.DictReader((tmp_path / "t.csv").open()))
