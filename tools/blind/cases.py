@@ -20,6 +20,8 @@ from tools.blind.make import Made
 from tools.blind.mjcf import build
 from tools.blind.plants import PLANTS
 
+DIGITS = 5  # of numbers in labels
+
 
 def write(out: Path, made: list[Made], seed: int) -> str:
     """Write folders and labels.
@@ -42,11 +44,25 @@ def write(out: Path, made: list[Made], seed: int) -> str:
             table = np.column_stack(list(columns.values()))
             with (folder / f"episode_{i}.csv").open("w") as file:
                 np.savetxt(file, table, fmt="%.9g", delimiter=",", header=",".join(columns), comments="")
-    text = json.dumps({"seed": seed, "cases": {one.case.name: label(one) for one in made}}, indent=1)
+    return seal(out, {"seed": seed, "cases": {one.case.name: label(one) for one in made}})
+
+
+def seal(out: Path, hidden: dict[str, Any]) -> str:
+    """Write labels and their hash, which is the same on processors that round the simulations differently."""
+    text = json.dumps(_rounded(hidden), indent=1)
     (out / "labels.json").write_text(text)
     digest = hashlib.sha256(text.encode()).hexdigest()
     (out / "labels.sha256").write_text(digest + "\n")
     return digest
+
+
+def _rounded(x: Any) -> Any:
+    """The same with numbers of DIGITS digits."""
+    if isinstance(x, float):
+        return float(f"{x:.{DIGITS}g}")
+    if isinstance(x, dict):
+        return {k: _rounded(v) for k, v in x.items()}
+    return [_rounded(v) for v in x] if isinstance(x, list | tuple) else x
 
 
 def label(made: Made) -> dict[str, Any]:

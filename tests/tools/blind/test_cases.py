@@ -72,3 +72,11 @@ def test_data_are_reproducible_and_labels_are_sealed(tmp_path: Path) -> None:
     (tmp_path / "a/labels.json").write_text(text.replace('"single"', '"none"'))
     with pytest.raises(ValueError, match="hash"):
         cases.labels(tmp_path / "a")
+
+
+def test_labels_have_the_same_hash_on_processors_that_round_differently(tmp_path: Path) -> None:
+    def seal(size: float) -> str:
+        return cases.seal(tmp_path, {"seed": 3, "cases": {"a": {"effects": [{"size": size, "at": ("motor",)}]}}})
+
+    assert seal(0.123456789) == seal(0.123456788) != seal(0.123556789)
+    assert cases.labels(tmp_path)["a"]["effects"] == [{"size": 0.12356, "at": ["motor"]}]
