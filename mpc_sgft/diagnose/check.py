@@ -1,36 +1,55 @@
-"""From columns to episodes: names, time, numbers and units are checked, gaps split, jitter evened out."""
+"""From columns to episodes: names, time and numbers are checked, gaps split, jitter evened out."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
 
 import numpy as np
 from scipy.interpolate import CubicSpline
 
+from mpc_sgft.diagnose.plant import Axis
 from mpc_sgft.diagnose.record import MIN_SAMPLES, Array, Episode, Index, Table
+from mpc_sgft.diagnose.units import check_order, check_speeds, check_units
 from mpc_sgft.errors import UserError
 
 KINDS = ("qpos", "qvel", "force", "sensor")
 GAP = 3.5  # a pause longer than this many sample times starts a new episode
 JITTER = 0.01  # of a sample time; more is interpolated away
-DEGREES, MILLIMETRES = 20.0, 200.0  # how many times the model's range a reading must exceed to be taken for these
 
 
-def episodes(table: Table, actuators: Sequence[str], joints: dict[str, tuple[float, float]]) -> list[Episode]:
+def check_settings(window: float | None, seed: int, max_effects: int) -> None:
+    """Numbers that no data could save.
+
+    Raises:
+        UserError: Which, and what is allowed.
+    """
+    if window is not None and not (np.isfinite(window) and window > 0):
+        raise UserError(f"--window {window:g}: the length of a simulated window is a number above 0 [s].")
+    if seed < 0:
+        raise UserError(f"--seed {seed}: a whole number from 0 on is needed.")
+    if max_effects < 1:
+        raise UserError(f"--max-effects {max_effects}: at least one effect must be allowed.")
+
+
+def episodes(
+    table: Table, actuators: Sequence[str], joints: Mapping[str, Axis], servos: Mapping[str, str] | None = None
+) -> list[Episode]:
     """The uninterrupted pieces of one file.
 
     Args:
         table: What was read.
         actuators: The model's actuators.
-        joints: The model's hinges and slides -> range [rad or m], (-inf, inf) where it has none.
+        joints: The model's hinges and slides.
+        servos: Actuators whose command is where a joint shall be -> that joint.
 
     Raises:
         UserError: If a column is missing or misnamed, time is not increasing, a number is not finite, units do not
-            fit the model, nothing moves, or there are too few samples.
+            fit the model or one another, a command comes after what it commands, nothing moves, or there are too few
+            samples.
     """
     columns = table.columns
-    _names(table, actuators, list(joints))
+    strange = _names(table, actuators, list(joints))
     time = columns["time"]
     bad = [name for name, values in columns.items() if _known(name) and not np.isfinite(values).all()]
     if bad:
@@ -45,9 +64,11 @@ def episodes(table: Table, actuators: Sequence[str], joints: dict[str, tuple[flo
     dt = float(np.median(steps))
     if dt > 0.2:
         raise UserError(f"{table.name}: one sample every {dt:g} s. `time` is in seconds; is this milliseconds?")
-    _units(table, joints)
+    check_units(table, joints)
     _moves(table, actuators, list(joints))
-    notes = (f"{table.name}: {table.lost}",) if table.lost else ()
+    check_speeds(table, joints)
+    check_order(table, servos or {})
+    notes = tuple(f"{table.name}: {what}" for what in (table.lost, strange) if what)
     if all(np.ptp(columns[f"ctrl/{a}"]) == 0 for a in actuators):
         notes += (f"{table.name}: the commands are constant: what acts on commands cannot show here",)
     cuts = np.flatnonzero(steps > GAP * dt) + 1
@@ -65,34 +86,32 @@ def _known(name: str) -> bool:
     return name == "time" or name.split("/")[0] in ("ctrl", *KINDS)
 
 
-def _names(table: Table, actuators: Sequence[str], joints: Sequence[str]) -> None:
-    """Every actuator and every joint of the model needs its column; no ctrl column may be strange to the model."""
+def _names(table: Table, actuators: Sequence[str], joints: Sequence[str]) -> str:
+    """Every actuator and every joint of the model needs its column; no ctrl column may be strange to the model.
+
+    Returns:
+        Which columns mean nothing here, in words; empty if all are known.
+    """
     has = list(table.columns)
     wanted = ["time", *(f"ctrl/{a}" for a in actuators), *(f"qpos/{j}" for j in joints)]
     missing = [name for name in wanted if name not in has]
     if missing:
         near = {name: get_close_matches(name, has, 1, 0.5) for name in missing}
         hints = [f"{name} (nearest: {match[0]})" if match else name for name, match in near.items()]
-        raise UserError(f"{table.name}: columns missing: {', '.join(hints)}. The file has: {', '.join(has)}.")
+        raise UserError(
+            f"{table.name}: columns missing: {', '.join(hints)}. The file has: {', '.join(has)}. "
+            f"The model has the actuators {', '.join(actuators)} and the joints {', '.join(joints)}."
+        )
     for kind, known in (("ctrl", actuators), ("force", actuators), ("qvel", joints)):
         for name in has:
             if name.startswith(f"{kind}/") and name.split("/", 1)[1] not in known:
                 what = "joint" if kind == "qvel" else "actuator"
                 raise UserError(f"{table.name}: {name}: the model has no such {what}. It has: {', '.join(known)}.")
-
-
-def _units(table: Table, joints: dict[str, tuple[float, float]]) -> None:
-    for joint, (low, high) in joints.items():
-        if not np.isfinite([low, high]).all():
-            continue
-        seen = np.abs(table.columns[f"qpos/{joint}"]).max()
-        limit = max(abs(low), abs(high))
-        if seen > MILLIMETRES * limit:
-            raise UserError(
-                f"{table.name}: qpos/{joint} reaches {seen:g}, the model's range is {limit:g}: millimetres?"
-            )
-        if seen > DEGREES * limit:
-            raise UserError(f"{table.name}: qpos/{joint} reaches {seen:g}, the model's range is {limit:g}: degrees?")
+    possible = [*wanted, *(f"force/{a}" for a in actuators), *(f"qvel/{j}" for j in joints)]
+    strange = [n for n in has if n not in possible and not n.startswith("sensor/")]
+    near = [get_close_matches(n, [p for p in possible if p not in has], 1, 0.6) for n in strange]
+    words = [f"{n} (is it {m[0]}?)" if m else n for n, m in zip(strange, near, strict=True)]
+    return f"columns that mean nothing here and were not used: {', '.join(words)}" if words else ""
 
 
 def _moves(table: Table, actuators: Sequence[str], joints: Sequence[str]) -> None:

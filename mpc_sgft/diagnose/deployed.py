@@ -14,11 +14,12 @@ import yaml
 
 from envs.effects.base import Effect
 from mpc_sgft.diagnose.chain import Chain, Prediction, effects_of
+from mpc_sgft.diagnose.check import check_settings
 from mpc_sgft.diagnose.deployment import Deployment, read_deployment
 from mpc_sgft.diagnose.entry import Entry
 from mpc_sgft.diagnose.fit import fit
 from mpc_sgft.diagnose.motion import SUB
-from mpc_sgft.diagnose.name import Verdict, judge_entries
+from mpc_sgft.diagnose.name import Verdict, caution, judge_entries
 from mpc_sgft.diagnose.outlook import next_experiment
 from mpc_sgft.diagnose.prepare import Setup, cut, split
 from mpc_sgft.diagnose.record import Array
@@ -27,7 +28,6 @@ from mpc_sgft.diagnose.run import candidate_rows, effect_rows, reduction
 from mpc_sgft.diagnose.screen import Effort
 from mpc_sgft.diagnose.search import search
 from mpc_sgft.diagnose.suspects import gap_of, suspects
-from mpc_sgft.errors import UserError
 from mpc_sgft.log import progress as bar_of
 
 LENGTH = 6  # control steps in a window
@@ -61,10 +61,7 @@ def diagnose_run(
     Raises:
         UserError: For a folder that cannot be used.
     """
-    if max_effects < 1:
-        raise UserError(f"max_effects={max_effects}: at least one effect must be allowed.")
-    if window is not None and not 0 < window < np.inf:
-        raise UserError(f"--window {window}: a length in seconds above 0.")
+    check_settings(window, seed, max_effects)
     began, rng = time.perf_counter(), np.random.default_rng(seed)
     deployment = read_deployment(run)
     setup = prepare(deployment, window, held_out)
@@ -81,6 +78,7 @@ def diagnose_run(
     notes = list(deployment.notes)
     if len(deployment.episodes) == 1:
         notes.append("one episode only: its end is held out, so that both sides come from the same run")
+    notes += caution(verdict)
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
         notes += write(deployment, verdict.best, out)

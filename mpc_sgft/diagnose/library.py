@@ -124,9 +124,9 @@ def make_term(plant: Plant, name: str, place: str, scales: Scales, fixed: Mappin
     kind = kind_of(name)
     parameters = {p: par for p, par in TABLE[name].parameters.items() if p not in (fixed or {})}
     pars = list(parameters.values())
-    sizes = np.array([par.size(scales) for par in pars])
-    neutral = np.array([par.neutral(scales) if callable(par.neutral) else par.neutral for par in pars])
     hard = np.array([kind.bounds.get(p, (-np.inf, np.inf)) for p in parameters]).reshape(-1, 2)
+    sizes = np.minimum([par.size(scales) for par in pars], hard[:, 1] - hard[:, 0])  # at rest, sizes may be anything
+    neutral = np.array([par.neutral(scales) if callable(par.neutral) else par.neutral for par in pars])
     soft = np.array([(neutral[i] + par.low * sizes[i], neutral[i] + par.high * sizes[i]) for i, par in enumerate(pars)])
     low, high = np.maximum(hard[:, 0], soft[:, 0]), np.minimum(hard[:, 1], soft[:, 1])
     begins = [[s(scales) if callable(s) else s for s in par.starts] for par in pars]

@@ -117,10 +117,11 @@ def judge_entries(
         return Verdict("unknown", best, ties, probability, reason)
     times = np.sqrt(np.expm1(best.error))
     if not best.effects:
-        reason = "the nominal model's error is within noise and the simulator's floor"
-        if not settled(base):
-            reason = f"nothing explains the rest, {times:.1f} times noise and floor, on windows that were not fitted"
-        return Verdict("none", best, [], probability, reason)
+        if settled(base):
+            reason = "the nominal model's error is within noise and the simulator's floor"
+            return Verdict("none", best, [], probability, reason)
+        reason = f"nothing explains the error, {times:.1f} times noise and floor, on windows that were not fitted"
+        return Verdict("unknown", best, [], probability, reason)
     left = np.expm1(best.error) - 1.0
     if left > max(NEAR, (1 - EXPLAINED) * (np.expm1(base.error) - 1.0)):
         reason = f"{_list(best)} leaves {times:.1f} times noise and floor, which no name in the library explains"
@@ -130,6 +131,14 @@ def judge_entries(
     if open_ties:
         return Verdict("not_identifiable", best, named, probability, f"{_list(best)} and {len(open_ties)} others tie")
     return Verdict("effect", best, named, probability, f"no larger set is credibly better than {_list(best)}")
+
+
+def caution(verdict: Verdict) -> list[str]:
+    """A note where the repaired files hold effects that the report does not name."""
+    if verdict.kind != "unknown" or not verdict.best.effects:
+        return []
+    held = _list(verdict.best)
+    return [f"repaired.xml and effects.yaml hold {held}: a fit that takes part of the error away, not its name"]
 
 
 def find_ties(setup: Setup[Any], best: Entry, entries: list[Entry], rng: np.random.Generator) -> list[Entry]:

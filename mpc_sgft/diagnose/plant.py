@@ -6,6 +6,7 @@ import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -17,6 +18,14 @@ from mpc_sgft.errors import UserError
 SHARP = 5e-4  # [s] longest step of a fit that is judged
 FORCE = "diagnose/force/"  # sensors that are added for the comparison
 SCALAR = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
+
+
+class Axis(NamedTuple):
+    """What a joint's readings can be: its limits [rad or m], infinite where the model has none, and its kind."""
+
+    low: float = -np.inf
+    high: float = np.inf
+    slide: bool = False
 
 
 @dataclass(frozen=True)
@@ -109,12 +118,26 @@ class Plant:
         m = self.model
         return [m.body(i).name for i in range(1, m.nbody) if m.body_weldid[i] and m.body_mass[i] > 0]
 
-    def ranges(self) -> dict[str, tuple[float, float]]:
-        """Joint -> limits, infinite where the model has none."""
-        m = self.model
+    def axes(self) -> dict[str, Axis]:
+        """Joint -> its limits and kind."""
+        m, slide = self.model, int(mujoco.mjtJoint.mjJNT_SLIDE)
+        limits = np.where(m.jnt_limited[:, None], m.jnt_range, [-np.inf, np.inf])
         return {
-            name: tuple(m.jnt_range[i]) if m.jnt_limited[i] else (-np.inf, np.inf) for i, name in enumerate(self.joints)
+            j: Axis(float(low), float(high), m.jnt_type[i] == slide)
+            for i, (j, (low, high)) in enumerate(zip(self.joints, limits, strict=True))
         }
+
+    def servos(self) -> dict[str, str]:
+        """Actuators whose command is where their joint shall be -> that joint."""
+        m = self.model
+        found = {a: joint_of(self, a) for i, a in enumerate(self.actuators) if m.actuator_biasprm[i, 1] < 0}
+        return {a: j for a, j in found.items() if j and m.actuator(a).gear[0] > 0}
+
+    def sensors(self) -> list[str]:
+        """Sensors of the scene itself that give one number."""
+        m = self.model
+        names = [m.sensor(i).name for i in range(m.nsensor) if m.sensor_dim[i] == 1]
+        return [n for n in names if n and not n.startswith(FORCE)]
 
     def sharper(self, longest: float = SHARP) -> Plant:
         """The same scene in steps no longer than this [s], with joint friction as dry as these allow.

@@ -20,6 +20,7 @@ from mpc_sgft.diagnose.windows import AFTER, BEFORE, EITHER
 from mpc_sgft.errors import UserError
 
 WINDOW = 1.0  # [s] where the data allow it
+LEAST = 10  # samples of a window
 MIN_WINDOWS = 4  # shorter windows rather than fewer
 UNITS = 24  # parts of windows to compare sets on, at least
 FEW_WINDOWS = 12  # fewer: one may hold all that shows an effect
@@ -71,17 +72,31 @@ class Setup(Generic[P]):
 
 
 def default_window(episodes: Sequence[Episode], joints: Sequence[str]) -> float:
-    """At most WINDOW, so that windows fill the shortest episode and there are enough of them; at least ten samples."""
+    """At most WINDOW, so that windows fill the shortest episode and there are enough of them; LEAST samples."""
     dt, shortest = episodes[0].dt, min(len(e.ctrl) - 1 - smooth(e, joints).half for e in episodes)
     longest = min(WINDOW, sum(e.seconds for e in episodes) / MIN_WINDOWS)
     pieces = int(np.ceil(shortest * dt / longest - 0.01))
-    return max(10, shortest // pieces) * dt
+    return max(LEAST, shortest // pieces) * dt
+
+
+def _fits(window: float, episodes: Sequence[Episode], joints: Sequence[str]) -> None:
+    dt, longest = episodes[0].dt, max(len(e.ctrl) - 1 - smooth(e, joints).half for e in episodes)
+    least, most = LEAST * dt, longest * dt
+    if not least <= window <= most:
+        raise UserError(
+            f"--window {window:g} does not fit these episodes: from {least:g} s ({LEAST} samples) to {most:g} s (the "
+            "longest of them) are possible. Leave it out, and it is chosen from the data."
+        )
 
 
 def default_signals(episodes: Sequence[Episode], plant: Plant) -> list[str]:
-    """Positions, and measured actuator forces: both are independent witnesses. Velocities only start the windows."""
-    has = episodes[0].signals
-    return [n for n in has if n.startswith("qpos/")] + [n for n in has if n.startswith("force/")]
+    """Positions, measured actuator forces, and sensors that the scene has too: independent witnesses.
+
+    Velocities only start the windows.
+    """
+    has = [n for n in episodes[0].signals if all(n in e.signals for e in episodes)]
+    forces = [n for n in has if n.startswith("force/")]
+    return [n for n in has if n.startswith("qpos/")] + forces + [n for n in has if n[7:] in plant.sensors()]
 
 
 def prepare(
@@ -98,6 +113,12 @@ def prepare(
     missing = [s for s in chosen if any(s not in e.signals for e in episodes)]
     if missing:
         raise UserError(f"signal {missing[0]!r} is not in every episode. There are: {', '.join(episodes[0].signals)}.")
+    for name in chosen:
+        if name.startswith("sensor/") and name[7:] not in plant.sensors():
+            there = ", ".join(plant.sensors()) or "(none)"
+            raise UserError(f"signal {name!r}: the scene has no sensor of that name with one number. It has: {there}.")
+    if window is not None:
+        _fits(window, episodes, plant.joints)
     replayer = Replayer(plant, episodes, window or default_window(episodes, plant.joints), chosen)
     if len(replayer.windows.start) < 4:
         raise UserError(f"only {len(replayer.windows.start)} windows: give more data or a shorter --window.")

@@ -96,12 +96,17 @@ def read_table(path: Path) -> Table:
 
 
 def _read_csv(path: Path) -> dict[str, Array]:
-    with path.open(newline="") as file:
-        rows = csv.reader(file)
-        header = [name.strip() for name in next(rows, [])]
-        body = [row for row in rows if row]
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            rows = csv.reader(file)
+            header = [name.strip() for name in next(rows, [])]
+            body = [row for row in rows if row]
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise UserError(f"{path}: not a CSV file in UTF-8 ({error}). Save it as comma-separated text.") from error
     if not header or not body:
         raise UserError(f"{path}: empty. A CSV episode has a header line and one row per sample.")
+    if twice := sorted({name for name in header if header.count(name) > 1}):
+        raise UserError(f"{path}: the column {twice[0]!r} is there {header.count(twice[0])} times; keep one of them.")
     for i, row in enumerate(body):
         if len(row) != len(header):
             raise UserError(f"{path}: line {i + 2} has {len(row)} values, the header names {len(header)} columns.")

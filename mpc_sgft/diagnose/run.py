@@ -11,14 +11,14 @@ import mujoco
 import numpy as np
 
 from mpc_sgft.diagnose import judge, repair
-from mpc_sgft.diagnose.check import episodes
+from mpc_sgft.diagnose.check import check_settings, episodes
 from mpc_sgft.diagnose.entry import Entry
 from mpc_sgft.diagnose.experiment import next_experiment
 from mpc_sgft.diagnose.fit import change_of
 from mpc_sgft.diagnose.flexible import flexible_fit
 from mpc_sgft.diagnose.library import candidates, numbers
 from mpc_sgft.diagnose.locate import locate
-from mpc_sgft.diagnose.name import Verdict, effect_probability, intervals, judge_entries, settled
+from mpc_sgft.diagnose.name import Verdict, caution, effect_probability, intervals, judge_entries, settled
 from mpc_sgft.diagnose.name import choose as choose_set
 from mpc_sgft.diagnose.nominal import nominal_terms, refit_table
 from mpc_sgft.diagnose.plant import SHARP, Change, Plant
@@ -41,7 +41,8 @@ def read(plant: Plant, data: Sequence[str | Path]) -> list[Episode]:
     Raises:
         UserError: If they are not usable or do not share a sample time.
     """
-    found = [e for path in files(data) for e in episodes(read_table(path), plant.actuators, plant.ranges())]
+    axes, servos = plant.axes(), plant.servos()
+    found = [e for path in files(data) for e in episodes(read_table(path), plant.actuators, axes, servos)]
     steps = [e.dt for e in found]
     if max(steps) > 1.05 * min(steps):
         raise UserError(
@@ -65,8 +66,7 @@ def run(
     progress: bool,
 ) -> Report:
     """As `mpc_sgft.diagnose.diagnose`, on episodes in memory."""
-    if max_effects < 1:
-        raise UserError(f"max_effects={max_effects}: at least one effect must be allowed.")
+    check_settings(window, seed, max_effects)
     began, rng = time.perf_counter(), np.random.default_rng(seed)
     nominal = nominal_terms(plant, uncertain)
     for step in sorted({min(step, recorded[0].dt) for step in STEPS}, reverse=True):
@@ -98,6 +98,7 @@ def run(
     notes = [n for e in recorded for n in e.notes]
     if len(recorded) == 1:
         notes.append("one episode only: its end is held out, so that both sides come from the same run")
+    notes += caution(verdict)
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
         notes += repair.write(plant, verdict.best, out)

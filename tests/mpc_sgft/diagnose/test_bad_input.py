@@ -8,12 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from mpc_sgft.diagnose.__main__ import main
 from mpc_sgft.diagnose.check import episodes
-from mpc_sgft.diagnose.plant import load_plant
+from mpc_sgft.diagnose.plant import Axis, load_plant
 from mpc_sgft.diagnose.record import Table, files, read_table, write_csv
 from mpc_sgft.errors import UserError
+from tests.mpc_sgft.diagnose.conftest import slide_data
 
-RANGES = {"x": (-2.0, 2.0)}
+CHIRP = np.sin(1e-3 * np.arange(209) ** 2)
+RANGES = {"x": Axis(-2.0, 2.0, slide=True)}
 
 
 def _table(**changed: np.ndarray) -> Table:
@@ -30,7 +33,7 @@ def test_a_good_table_becomes_one_episode() -> None:
 def test_a_misnamed_column_is_told_with_the_nearest_name() -> None:
     table = _table()
     table.columns["qpos/slide_x"] = table.columns.pop("qpos/x")
-    with pytest.raises(UserError, match=r"qpos/x \(nearest: qpos/slide_x\).*The file has: time, ctrl/motor"):
+    with pytest.raises(UserError, match=r"qpos/x \(nearest: qpos/slide_x\).*The file has: time, ctrl/motor.*joints x"):
         episodes(table, ["motor"], RANGES)
 
 
@@ -45,14 +48,23 @@ def test_an_actuator_that_the_model_lacks() -> None:
         ({"time": np.r_[np.arange(100), np.arange(100)] * 0.01}, "time does not increase at row 100"),
         ({"time": np.arange(200) * 10.0}, "is this milliseconds"),
         ({"qpos__x": np.r_[np.ones(7), np.nan, np.ones(192)]}, "qpos/x is not a number in row 7"),
-        ({"qpos__x": 100 * np.cos(np.arange(200))}, "degrees"),
+        ({"qpos__x": 30 * np.cos(np.arange(200))}, "centimetres"),
         ({"qpos__x": 1000 * np.cos(np.arange(200))}, "millimetres"),
+        ({"qvel__x": -100 * np.sin(np.arange(200) * 0.01)}, "1e[+]03 times the derivative"),
+        ({"qpos__x": CHIRP[9:], "ctrl__motor": CHIRP[:-9]}, "9 samples earlier.*swapped"),
         ({"qpos__x": np.zeros(200), "ctrl__motor": np.ones(200)}, "no joint moves, and the commands are constant"),
     ],
 )
 def test_numbers_that_cannot_be(changed: dict[str, np.ndarray], message: str) -> None:
     with pytest.raises(UserError, match=message):
-        episodes(_table(**changed), ["motor"], RANGES)
+        episodes(_table(**changed), ["motor"], RANGES, {"motor": "x"})
+
+
+def test_columns_that_mean_nothing_are_told_with_the_nearest_name() -> None:
+    table = _table(qvell__x=np.zeros(200), torque__motor=np.zeros(200), sensor__temperature=np.zeros(200))
+    (episode,) = episodes(table, ["motor"], RANGES)
+    assert "not used: qvell/x (is it qvel/x?), torque/motor" in episode.notes[0]
+    assert "temperature" not in episode.notes[0]
 
 
 def test_a_constant_command_is_told() -> None:
@@ -137,11 +149,19 @@ def test_csv_and_parquet_hold_the_same(tmp_path: Path) -> None:
             np.testing.assert_allclose(read[key], values, atol=1e-9)
 
 
-@pytest.mark.parametrize("text", ["", "time,ctrl/m\n", "time,ctrl/m\n0,1\n0.1\n", "time\nzero\n"])
+@pytest.mark.parametrize("text", ["", "time,ctrl/m\n", "time,ctrl/m\n0,1\n0.1\n", "time\nzero\n", "time,a,a\n0,1,2\n"])
 def test_broken_csv(tmp_path: Path, text: str) -> None:
     (tmp_path / "a.csv").write_text(text)
     with pytest.raises(UserError, match=r"a\.csv"):
         read_table(tmp_path / "a.csv")
+
+
+def test_a_csv_of_another_alphabet(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_bytes("time,größe\n0,1\n".encode("latin-1"))
+    with pytest.raises(UserError, match="not a CSV file in UTF-8"):
+        read_table(tmp_path / "a.csv")
+    (tmp_path / "b.csv").write_bytes(b"\xef\xbb\xbftime,ctrl/m\n0,1\n")  # what spreadsheets put first
+    assert list(read_table(tmp_path / "b.csv").columns) == ["time", "ctrl/m"]
 
 
 def test_broken_parquet_and_mcap(tmp_path: Path) -> None:
@@ -180,6 +200,32 @@ def test_models_that_do_not_load(tmp_path: Path) -> None:
     (tmp_path / "still.xml").write_text("<mujoco><worldbody><geom size='1'/></worldbody></mujoco>")
     with pytest.raises(UserError, match="no actuator or no joint"):
         load_plant(tmp_path / "still.xml")
+
+
+@pytest.mark.parametrize(
+    ("args", "words"),
+    [
+        ("--window -1", "--window -1: the length of a simulated window is a number above 0"),
+        ("--window nan", "a number above 0"),
+        ("--window 100", "--window 100 does not fit these episodes: from 0.04 s"),
+        ("--window 0.001", "does not fit"),
+        ("--seed -1", "--seed -1: a whole number from 0 on"),
+        ("--max-effects 0", "at least one effect"),
+        ("--held-out 2", "held-out share 2.0"),
+        ("--held-out run7", "held-out episode 'run7' is not in the data"),
+        ("--signals qpos/y", "signal 'qpos/y' is not in every episode"),
+        ("--signals sensor/current", "the scene has no sensor of that name"),
+        ("--effects friction", "unknown effect 'friction'"),
+        ("--uncertain colour=0.1", "colour"),
+    ],
+)
+def test_settings_that_cannot_be(
+    args: str, words: str, slide: Path, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    columns = slide_data(1.0)
+    write_csv(tmp_path / "a.csv", columns | {"sensor/current": columns["ctrl/motor"]})
+    answer = main(["--model", str(slide), "--data", str(tmp_path / "a.csv"), "--out", str(tmp_path), *args.split()])
+    assert answer == 2 and words in capsys.readouterr().err
 
 
 def test_the_command_line_answers_and_refuses(command: Callable, slide: Path, tmp_path: Path) -> None:

@@ -105,7 +105,7 @@ def test_folders_that_are_no_deployment(tmp_path: Path, deployed) -> None:
         (["--retrain"], "the deployment was not finished"),
         (["--retrain", "--retrain-transitions", "0"], "a whole number from 1 on"),
         (["--effects", "backlash"], "unknown effect 'backlash'"),
-        (["--window", "-1"], "--window -1.0: a length in seconds above 0"),
+        (["--window", "-1"], "--window -1: the length of a simulated window is a number above 0"),
         (["--max-effects", "0"], "at least one effect must be allowed"),
     ],
 )

@@ -25,7 +25,7 @@ def dry(slide: Path, record) -> tuple[Plant, Setup[Problem]]:
     """A slide that sticks for long, recorded with much noise, before anyone knows of friction."""
     plant = load_plant(slide).sharper()
     table = read_table(record(seconds=8.0, coulomb=15.0, noise=5e-4))
-    recorded = episodes(table, plant.actuators, plant.ranges())
+    recorded = episodes(table, plant.actuators, plant.axes())
     return plant, prepare(plant, recorded, [], window=None, signals=None, held_out=None)
 
 

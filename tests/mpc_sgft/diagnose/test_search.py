@@ -13,7 +13,7 @@ from mpc_sgft.diagnose import search as searching
 from mpc_sgft.diagnose.entry import entry
 from mpc_sgft.diagnose.fit import fit
 from mpc_sgft.diagnose.library import Term, as_gap, candidates, settings
-from mpc_sgft.diagnose.name import gains, judge_entries
+from mpc_sgft.diagnose.name import caution, gains, judge_entries
 from mpc_sgft.diagnose.plant import Change, Plant
 from mpc_sgft.diagnose.prepare import NOISE, Setup
 from mpc_sgft.diagnose.screen import Effort
@@ -106,7 +106,26 @@ def test_names_that_leave_much_of_an_error_are_no_answer(before: float, after: f
     scatter = 0.01 * np.random.default_rng(0).normal(size=24)
     base = entry(setup, setup.baseline)._replace(errors=np.log1p(before) + scatter)
     named = entry(setup, fit(problem, [term("a")], [np.ones(1)], fitted))._replace(errors=np.log1p(after) + scatter)
-    assert judge_entries(setup, [base, named], None, np.random.default_rng(0)).kind == kind
+    verdict = judge_entries(setup, [base, named], None, np.random.default_rng(0))
+    assert verdict.kind == kind
+    assert [("hold a:" in note) for note in caution(verdict)] == [True] * (kind == "unknown")
+
+
+@pytest.mark.parametrize(("left", "kind"), [(1.1, "none"), (6.0, "unknown")])
+def test_an_error_that_nothing_explains_is_not_nothing(left: float, kind: str) -> None:
+    problem, fitted, none = Lines(), np.arange(18), np.zeros(1)
+    setup = Setup(problem, fitted, np.arange(18, 24), fitted // 3, fit(problem, [], [], fitted), none, none)
+    errors = np.log1p(left) + 0.01 * np.random.default_rng(0).normal(size=24)
+    base = entry(setup, setup.baseline)._replace(errors=errors)
+    verdict = judge_entries(setup, [base], None, np.random.default_rng(0))
+    assert verdict.kind == kind and not verdict.best.effects and not caution(verdict)
+
+
+def test_a_typical_size_is_no_larger_than_what_is_allowed() -> None:
+    plant = Plant(mujoco.MjSpec.from_string(PENDULUM))
+    still = {("joint", "hinge"): Scales(force=1.0, speed=1e-6)}  # drag is counted in force / speed^2
+    (drag,) = candidates(plant, still, ["quadratic_drag"])
+    assert drag.size[0] == drag.high[0] - drag.low[0] == 1e5
 
 
 def test_gravity_may_turn_about_one_axis_or_both() -> None:
