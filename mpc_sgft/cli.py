@@ -95,6 +95,7 @@ def _run(command: Command, flags: argparse.Namespace, given: list[str]) -> int:
     from mpc_sgft import compose
 
     values = {"device": ("auto", "cpu", "cuda"), **command.values}
+    given = compose.spread(given)
     overrides = [compose.normalise(text) for text in given]
     if flags.multirun:
         if flags.resume is not None or flags.config:

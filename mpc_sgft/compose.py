@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -15,6 +16,7 @@ from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
 from omegaconf import DictConfig, ListConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError
 
 from mpc_sgft import choices
 from mpc_sgft.errors import UserError, unknown
@@ -22,6 +24,22 @@ from mpc_sgft.errors import UserError, unknown
 ALIASES = {"horizon": "planner.horizon", "robot-ip": "backend.robot_ip", "dry-run": "backend.dry_run"}
 OPEN = ("gap.effects.", "randomize.")  # mappings that may gain keys on the command line
 FORM = re.compile(r"(?P<sign>\+\+|\+|~)?(?P<key>[A-Za-z_][\w./@-]*)(?P<rest>=.*)?", re.DOTALL)
+
+
+def spread(given: Sequence[str]) -> list[str]:
+    """The same overrides, with the effects themselves in place of `gap=FILE.yaml`, such as diagnose's effects.yaml.
+
+    Raises:
+        UserError: If the file is absent or holds no effects.
+    """
+    out: list[str] = []
+    for text in given:
+        key, _, value = text.lstrip("+").partition("=")
+        if key == "gap" and value.endswith(".yaml"):
+            out += ["gap=none", *(f"gap.effects.{name}={_literal(what)}" for name, what in _gap_file(value).items())]
+        else:
+            out.append(text)
+    return out
 
 
 def normalise(override: str) -> str:
@@ -209,6 +227,33 @@ def _compose(name: str, overrides: Sequence[str]) -> DictConfig:
             return hydra_compose(config_name=name, overrides=list(overrides), return_hydra_config=True)
     except (HydraException, OmegaConfBaseException) as err:
         raise UserError(first_line(err)) from err
+
+
+def _gap_file(path: str) -> dict[str, Any]:
+    try:
+        content = OmegaConf.to_container(OmegaConf.load(path))
+    except FileNotFoundError as err:
+        gaps = ", ".join(choices.groups()["gap"])
+        raise UserError(f"gap={path}: no such file. Give one with `effects:`, or a name: {gaps}.") from err
+    except (YAMLError, OmegaConfBaseException, OSError, UnicodeDecodeError) as err:
+        raise UserError(f"gap={path}: cannot be read: {first_line(err)}") from err
+    effects = content.get("effects") if isinstance(content, dict) else None
+    if not isinstance(effects, dict):
+        raise UserError(
+            f"gap={path}: it needs one key, `effects:`, with {{<effect>: {{<parameter>: <value>}}}} under it."
+        )
+    return {str(name): what for name, what in effects.items()}
+
+
+def _literal(value: Any) -> str:
+    """A value of a yaml file in Hydra's grammar."""
+    if isinstance(value, dict):
+        return "{" + ",".join(f"{k}:{_literal(v)}" for k, v in value.items()) + "}"
+    if isinstance(value, list):
+        return "[" + ",".join(map(_literal, value)) + "]"
+    if isinstance(value, str):
+        return "'" + value.replace("'", "\\'") + "'"
+    return json.dumps(value)
 
 
 def _values(override: Override) -> list[str]:

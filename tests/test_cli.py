@@ -202,6 +202,42 @@ def test_resume_takes_the_saved_config_and_its_folder(loops: Path, capsys) -> No
     assert capsys.readouterr().out.split("\n")[1:3] == ["7 none 2", str(loops / "first")]
 
 
+def test_a_gap_may_be_a_file(loops: Path, capsys) -> None:
+    """As diagnose writes it: names, lists, several places, small numbers, and nothing at all."""
+    effects = {
+        "coulomb_friction": [{"torque": 1e-7, "at": ["fr3_joint1"]}, {"torque": -2.5, "at": ["qpos/elbow, left"]}],
+        "actuator_offset": {"offset": [0.1, -0.2]},
+        "payload": {"mass": 2, "position": [0.0, 0.0, 0.1], "at": "link7"},
+        "deadband": None,
+    }
+    Path("found.yaml").write_text("# a comment\n" + yaml.safe_dump({"effects": effects}))
+    given = compose.spread(["seed=1", "gap=found.yaml", "gap.effects.payload.mass=3"])
+    cfg = compose.compose("deploy", [compose.normalise(text) for text in given], given)
+    effects["payload"]["mass"] = 3  # pyright: ignore
+    assert OmegaConf.to_container(cfg.gap.effects) == effects and cfg.seed == 1
+    assert "+coulomb_friction=[{" in cfg.chosen.gap
+    Path("one.yaml").write_text("effects: {actuator_gain: {gain: 0.6}}")
+    assert cli.run(probe("show"), ["gap=one.yaml"]) == 0
+    assert capsys.readouterr().out == "0 none+actuator_gain={gain:0.6} 4\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (None, "no such file. Give one with `effects:`, or a name: "),
+        ("effects: [", "cannot be read"),
+        ("payload: {mass: 1}", "it needs one key, `effects:`"),
+        ("- 1", "it needs one key, `effects:`"),
+        ("effects: {paiload: {mass: 1}}", "unknown effect 'paiload'"),
+    ],
+)
+def test_a_gap_file_that_is_none(text: str | None, words: str, loops: Path, capsys) -> None:
+    if text is not None:
+        Path("gap.yaml").write_text(text)
+    assert cli.run(probe("show"), ["gap=gap.yaml"]) == 2
+    assert words in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("change", ["task=pendulum", "seed=1", "gap.effects.payload.mass=1", "run_dir=other"])
 def test_resume_refuses_to_become_another_run(change: str, loops: Path, capsys) -> None:
     assert cli.run(probe("folder"), ["run_dir=first"]) == 0
