@@ -22,8 +22,8 @@ import numpy as np
 from envs.effects import load
 from mpc_sgft.diagnose import diagnose
 from mpc_sgft.diagnose.deployed import diagnose_run
-from mpc_sgft.diagnose.library import kind_of
 from mpc_sgft.diagnose.record import write_csv
+from mpc_sgft.diagnose.rows import kind_of
 from mpc_sgft.diagnose.table import TABLE
 
 PENDULUM = """<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody><body>

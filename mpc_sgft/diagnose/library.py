@@ -1,7 +1,7 @@
-"""What diagnose must know of each effect: where it can sit, how large it may be, and where a fit should start.
+"""Candidates: effects at places, how large they may be, and where a fit should start.
 
-The physics is in envs/effects/<name>.py. A new effect needs one row in TABLE. Commands are changed before the windows
-are cut, so that delays and lags reach back before a window's start.
+The physics is in envs/effects/<name>.py, and what to know of it in rows.py. Commands are changed before the windows are
+cut, so that delays and lags reach back before a window's start.
 """
 
 from __future__ import annotations
@@ -9,17 +9,17 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from functools import partial
-from importlib import import_module
 from typing import Any
 
 import mujoco
 import numpy as np
 
-from envs.effects.base import Effect, available, load
+from envs.effects.base import Effect, load
 from mpc_sgft.diagnose.plant import Change, Plant, joint_of
 from mpc_sgft.diagnose.record import Array
+from mpc_sgft.diagnose.rows import kind_of, possible, row_of
 from mpc_sgft.diagnose.signals import SIGNALS
-from mpc_sgft.diagnose.table import INCLUDES, TABLE, Scales
+from mpc_sgft.diagnose.table import INCLUDES, TABLE, Row, Scales
 from mpc_sgft.errors import UserError, unknown
 
 HIDDEN = ("velocity", "rest", "deflection", "damping_ratio")  # parameters that mean nothing while the effect is neutral
@@ -70,10 +70,10 @@ def candidates(plant: Plant, scales: Mapping[tuple[str, str], Scales], effects: 
     Raises:
         UserError: For an effect that does not exist or that this kind of data cannot show.
     """
-    possible = [name for name in TABLE if name in available()]
+    known = possible()
     for name in effects or []:
-        if name not in possible:
-            raise unknown("effect", name, possible, "--effects")
+        if name not in known:
+            raise unknown("effect", name, known, "--effects")
     places = {
         "joint": plant.joints,
         "actuator": plant.actuators,
@@ -84,10 +84,10 @@ def candidates(plant: Plant, scales: Mapping[tuple[str, str], Scales], effects: 
     }
     driven = [j for a in plant.actuators if (j := joint_of(plant, a))]
     built: list[Term] = []
-    for name in (n for n in possible if effects is None or n in effects):
-        kind = kind_of(name).place
-        for place in driven if TABLE[name].driven else places[kind]:
-            variants = load_positions(plant, place) if name == "payload" else TABLE[name].variants
+    for name in (n for n in known if effects is None or n in effects):
+        kind, row = kind_of(name).place, _row_of(name)
+        for place in driven if row.driven else places[kind]:
+            variants = load_positions(plant, place) if name == "payload" else row.variants
             built += [make_term(plant, name, place, scales.get((kind, place), Scales()), fixed) for fixed in variants]
     for name in effects or []:
         if not any(t.effect == name for t in built):
@@ -115,14 +115,16 @@ def load_positions(plant: Plant, body: str) -> list[dict[str, Any]]:
     return [{"position": [round(float(x), 6) for x in p]} for p in points]
 
 
-def kind_of(name: str) -> type[Effect]:
-    return import_module(f"envs.effects.{name}").EFFECT
+def _row_of(name: str) -> Row:
+    row = row_of(name)
+    assert row is not None, name
+    return row
 
 
 def make_term(plant: Plant, name: str, place: str, scales: Scales, fixed: Mapping[str, Any] | None = None) -> Term:
     """One effect at one place ("" for the whole scene)."""
     kind = kind_of(name)
-    parameters = {p: par for p, par in TABLE[name].parameters.items() if p not in (fixed or {})}
+    parameters = {p: par for p, par in _row_of(name).parameters.items() if p not in (fixed or {})}
     pars = list(parameters.values())
     hard = np.array([kind.bounds.get(p, (-np.inf, np.inf)) for p in parameters]).reshape(-1, 2)
     sizes = np.minimum([par.size(scales) for par in pars], hard[:, 1] - hard[:, 0])  # at rest, sizes may be anything
@@ -168,7 +170,7 @@ def as_gap(found: Iterable[tuple[str, dict[str, Any]]]) -> dict[str, Any]:
 def numbers(effect: str, names: Sequence[str], x: Array) -> dict[str, float]:
     """The effect's own parameters from the fitted ones."""
     fitted = dict(zip(names, map(float, x), strict=True))
-    sums = TABLE[effect].sums if effect in TABLE else {}
+    sums = sums_of(effect)
     inner = (
         {part for parts in sums.values() for part in parts} - set(f.name for f in fields(kind_of(effect)))
         if sums
@@ -177,6 +179,11 @@ def numbers(effect: str, names: Sequence[str], x: Array) -> dict[str, float]:
     return {k: v for k, v in fitted.items() if k not in inner} | {
         k: fitted[a] + fitted[b] for k, (a, b) in sums.items()
     }
+
+
+def sums_of(effect: str) -> Mapping[str, tuple[str, str]]:
+    """Parameters of an effect, or of a nominal quantity, that are sums of two fitted ones."""
+    return TABLE[effect].sums if effect in TABLE else {}
 
 
 def _change(

@@ -16,7 +16,7 @@ from mpc_sgft.diagnose.entry import Entry
 from mpc_sgft.diagnose.experiment import next_experiment
 from mpc_sgft.diagnose.fit import change_of
 from mpc_sgft.diagnose.flexible import flexible_fit
-from mpc_sgft.diagnose.library import candidates, numbers
+from mpc_sgft.diagnose.library import candidates, numbers, sums_of
 from mpc_sgft.diagnose.locate import locate
 from mpc_sgft.diagnose.name import Verdict, caution, effect_probability, intervals, judge_entries, settled
 from mpc_sgft.diagnose.name import choose as choose_set
@@ -27,7 +27,6 @@ from mpc_sgft.diagnose.record import Array, Episode, files, read_table
 from mpc_sgft.diagnose.replay import Replayer
 from mpc_sgft.diagnose.report import MAX_CANDIDATES, Report
 from mpc_sgft.diagnose.search import again, nearest, search
-from mpc_sgft.diagnose.table import TABLE
 from mpc_sgft.errors import UserError
 from mpc_sgft.log import progress as bar_of
 
@@ -160,7 +159,7 @@ def effect_rows(best: Entry, entries: list[Entry], verdict: Verdict) -> list[dic
     for term, value, (low, high), share in zip(best.terms, best.values, bounds, shares, strict=True):
         columns = [numbers(term.effect, term.names, x) for x in (value, low, high)]
         units = dict(zip(term.names, term.units, strict=True))
-        sums = TABLE[term.effect].sums if term.effect in TABLE else {}
+        sums = sums_of(term.effect)
         out.append(
             {
                 "name": term.effect,

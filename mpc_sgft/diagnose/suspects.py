@@ -15,8 +15,9 @@ import numpy as np
 
 from envs.effects.base import Effect, load
 from envs.task import AbstractTask
-from mpc_sgft.diagnose.library import Term, as_gap, kind_of
+from mpc_sgft.diagnose.library import Term, as_gap
 from mpc_sgft.diagnose.record import Array
+from mpc_sgft.diagnose.rows import kind_of
 from mpc_sgft.errors import unknown
 
 
