@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from mpc_sgft.diagnose import judge
 from mpc_sgft.diagnose.entry import Entry, entry
-from mpc_sgft.diagnose.fit import fit
+from mpc_sgft.diagnose.fit import fit, robust, typical
 from mpc_sgft.diagnose.library import Term
 from mpc_sgft.diagnose.prepare import Setup
 from mpc_sgft.diagnose.screen import Effort, couple, key_of, proposals, screen, sharpen
@@ -61,6 +61,7 @@ def search(
             for proposal in sharpen(setup, [p for p in pairs if key_of(setup, p.terms) not in new], effort)[:full]:
                 f = fit(setup.problem, proposal.terms, proposal.start, setup.fitted, effort.last)
                 new[key_of(setup, proposal.terms)] = entry(setup, f)
+        new = {key: no_worse(setup, e, found, effort) for key, e in new.items()}
         found |= new
         if not new:
             break
@@ -72,6 +73,17 @@ def search(
         if best.error < setup.quiet:
             break
     return list((found | swaps(setup, found, terms, effort)).values())
+
+
+def no_worse(setup: Setup[Any], e: Entry, found: Mapping[frozenset[str], Entry], effort: Effort) -> Entry:
+    """A set as it was fitted, or fitted anew from the optimum of the best set within it, if that fits better."""
+    scale = typical(setup.baseline.r)
+    within = min((s for s in found.values() if s.key < e.key), key=lambda s: robust(s.fit.r, scale))
+    if robust(e.fit.r, scale) <= robust(within.fit.r, scale):
+        return e
+    there = {(t.label, t.names): v for t, v in zip(within.fit.terms, within.fit.values, strict=True)}
+    start = [there.get((t.label, t.names), np.clip(t.neutral, t.low, t.high)) for t in e.fit.terms]
+    return entry(setup, fit(setup.problem, e.fit.terms, start, setup.fitted, effort.last))
 
 
 def nearest(entries: Sequence[Entry]) -> Entry:

@@ -10,14 +10,14 @@ import pytest
 
 from mpc_sgft.diagnose import screen as screening
 from mpc_sgft.diagnose import search as searching
-from mpc_sgft.diagnose.entry import entry
+from mpc_sgft.diagnose.entry import Entry, entry
 from mpc_sgft.diagnose.fit import fit
 from mpc_sgft.diagnose.library import Term, as_gap, candidates, settings
 from mpc_sgft.diagnose.name import caution, gains, judge_entries
 from mpc_sgft.diagnose.plant import Change, Plant
 from mpc_sgft.diagnose.prepare import NOISE, Setup
 from mpc_sgft.diagnose.screen import Effort
-from mpc_sgft.diagnose.search import search, swaps
+from mpc_sgft.diagnose.search import no_worse, search, swaps
 from mpc_sgft.diagnose.table import Scales
 
 Points = Sequence[Sequence[np.ndarray]]
@@ -126,6 +126,24 @@ def test_a_typical_size_is_no_larger_than_what_is_allowed() -> None:
     still = {("joint", "hinge"): Scales(force=1.0, speed=1e-6)}  # drag is counted in force / speed^2
     (drag,) = candidates(plant, still, ["quadratic_drag"])
     assert drag.size[0] == drag.high[0] - drag.low[0] == 1e5
+
+
+def test_a_set_never_fits_worse_than_one_within_it() -> None:
+    """A fit that stopped at once where it began, far off, starts again from the best of what it holds."""
+    problem, fitted, none = Lines(), np.arange(18), np.zeros(1)
+    base = fit(problem, [], [], fitted)
+    setup = Setup(problem, fitted, np.arange(18, 24), fitted // 3, base, none, none, np.log1p)
+    x, y = term("x"), term("y")
+    small = [entry(setup, fit(problem, [t], [np.ones(1)], fitted)) for t in (x, y)]
+    stuck = entry(setup, fit(problem, [y, x], [40 * np.ones(1)] * 2, fitted, 0))
+    found = {e.key: e for e in (entry(setup, base), *small)}
+    better = no_worse(setup, stuck, found, Effort())
+
+    def cost(e: Entry) -> float:
+        return float((e.fit.r**2).sum())
+
+    assert cost(stuck) > 10 * cost(small[0]) and cost(better) <= min(cost(e) for e in small)
+    assert better.key == stuck.key and no_worse(setup, better, found, Effort()) is better
 
 
 def test_gravity_may_turn_about_one_axis_or_both() -> None:
