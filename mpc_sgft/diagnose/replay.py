@@ -30,6 +30,8 @@ FULL = mujoco.mjtState.mjSTATE_FULLPHYSICS
 CTRL = int(mujoco.mjtState.mjSTATE_CTRL)
 FORCED = CTRL | int(mujoco.mjtState.mjSTATE_QFRC_APPLIED)
 THREADS = int(os.environ.get("OMP_NUM_THREADS", len(os.sched_getaffinity(0))))
+NOTHING = mujoco.MjSpec().compile()
+SIZES = [n for n in dir(NOTHING) if n[0] == "n" and isinstance(getattr(NOTHING, n), int)]  # of all arrays of a model
 LEAD = 0.3  # [s] before a window, to find how rotors lean and bristles bend at its start
 EXPLODED = 1e6  # predictions are clipped here, so that an unstable candidate is bad, not infinite
 
@@ -346,10 +348,13 @@ class Replayer:
 
 
 def _alike(models: Sequence[mujoco.MjModel], changes: Sequence[Change]) -> list[list[int]]:
-    """Indices of models of the same layout, all with loaded friction or none: these can be rolled out in one call."""
+    """Indices of models of the same layout, all with loaded friction or none: these can be rolled out in one call.
+
+    One whose arrays are larger than those of the first would be written beyond the end of its data.
+    """
     groups: dict[tuple[int, ...], list[int]] = {}
     for k, (m, c) in enumerate(zip(models, changes, strict=True)):
-        layout = (m.nq, m.nv, m.nu, m.na, m.nbody, m.ntendon, m.neq, m.nM, m.npair)
+        layout = tuple(getattr(m, n) for n in SIZES)
         groups.setdefault((*layout, bool(c.frictions)), []).append(k)
     return list(groups.values())
 

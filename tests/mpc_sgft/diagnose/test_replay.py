@@ -13,7 +13,7 @@ from mpc_sgft.diagnose.library import candidates, enrich, make_term
 from mpc_sgft.diagnose.plant import Change, Plant
 from mpc_sgft.diagnose.prepare import discrepancy, prepare, scales
 from mpc_sgft.diagnose.record import Episode
-from mpc_sgft.diagnose.replay import Replayer
+from mpc_sgft.diagnose.replay import Replayer, _alike
 from mpc_sgft.diagnose.rub import Drive
 from mpc_sgft.diagnose.smooth import smooth
 from mpc_sgft.diagnose.table import TABLE, Scales
@@ -205,6 +205,25 @@ def test_effects_in_one_batch_do_not_disturb_each_other(plant) -> None:
         np.testing.assert_array_equal(replayer.simulate([change])[0], values)
 
 
+def test_models_whose_arrays_differ_are_never_rolled_out_together() -> None:
+    """A friction of two directions adds an actuator without an input, a load on another body other sparse blocks."""
+    arm = Plant(mujoco.MjSpec.from_string(TWO_LINKS))
+    scales = {("joint", "elbow"): Scales(), ("body", "upper"): Scales(), ("body", "lower"): Scales()}
+    rubs, upper, lower = (
+        make_term(arm, name, place, scales[kind, place])
+        for name, kind, place in (
+            ("asymmetric_friction", "joint", "elbow"),
+            ("payload", "body", "upper"),
+            ("payload", "body", "lower"),
+        )
+    )
+    for changes in ([Change(), rubs.build(np.array([1.0, 2.0]))], [t.build(np.ones(1)) for t in (upper, lower)]):
+        models = [arm.compile(c) for c in changes]
+        sizes = {(m.nq, m.nv, m.nu, m.na, m.nbody, m.ntendon, m.neq, m.nM, m.npair) for m in models}
+        assert len(sizes) == 1 and _alike(models, changes) == [[0], [1]]
+        assert _alike([models[1]] * 2, [changes[1]] * 2) == [[0, 1]]
+
+
 def test_an_effect_that_has_no_place_here_is_refused(plant) -> None:
     with pytest.raises(UserError, match="contact_friction: it needs geoms that touch"):
         candidates(plant, {}, ["viscous_friction", "contact_friction"])
@@ -222,6 +241,10 @@ def test_every_effect_of_the_table_is_known_and_neutral_at_its_neutral_value(pla
         np.testing.assert_allclose(same, nominal, atol=1e-6, err_msg=name)
 
 
+TWO_LINKS = """<mujoco><worldbody><body name="upper"><joint name="shoulder" axis="0 1 0"/>
+<geom size="0.05" pos="0.3 0 0" mass="1"/><body name="lower" pos="0.3 0 0"><joint name="elbow" axis="0 1 0"/>
+<geom size="0.05" pos="0.3 0 0" mass="1"/></body></body></worldbody>
+<actuator><motor name="first" joint="shoulder"/><motor name="second" joint="elbow"/></actuator></mujoco>"""
 SHARED = """<mujoco><worldbody><geom name="wall" type="plane" size="2 2 1" friction="0.3"/>
 <geom name="far" type="box" size="1 1 1" pos="9 9 9"/><body name="x"><joint name="x" type="slide" axis="1 0 0"/>
 <geom name="x" size="0.1" mass="2" friction="0.4"/></body></worldbody>
