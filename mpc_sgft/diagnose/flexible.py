@@ -1,4 +1,6 @@
-"""A residual model without a name: smooth random features of position, speed and command as an unknown joint force.
+"""A residual model without a name: waves over the position, and smooth random functions of it and the speed.
+
+Each is an unknown force at a joint, or, times the direction of motion, an unknown friction.
 
 The force of each feature is taken along the recorded motion and simulated; to first order the predictions are linear
 in the features' weights, so the fit is a ridge regression on the simulation error.
@@ -16,7 +18,8 @@ from mpc_sgft.diagnose.prepare import Setup
 from mpc_sgft.diagnose.record import Array, Index
 from mpc_sgft.diagnose.table import Scales
 
-FEATURES = 32  # per driven or moving joint
+WAVES, RUBS, RANDOM = 16, 4, 12  # per joint: over the position, the same times the direction, of position and speed
+SMOOTH = 4.0  # half waves over the range of the motion, from where on they cost more
 PUSH = 0.01  # of the typical force, to differentiate
 RIDGES = np.logspace(-6, 3, 10)
 
@@ -45,7 +48,7 @@ def flexible_fit(
     """Fit features on top of a set of effects, whose parameters move along (to first order)."""
     problem, replayer = setup.problem, setup.problem.replayer
     pick = np.concatenate([setup.fitted, setup.held])
-    features = _features(setup, scales, rng)  # [F, W, N, nj]
+    features, cost = _features(setup, scales, rng)
     change = change_of(best.fit.terms, best.fit.values)
     r0 = problem.residuals(best.fit.terms, [best.fit.values], pick)[0]
     response = np.stack(
@@ -56,10 +59,10 @@ def flexible_fit(
         -1,
     )  # [W, m, F]
     fitted = np.arange(len(setup.fitted))
-    J, count = best.fit.J, response.shape[-1]
+    J, count = best.fit.J, len(cost)
     own = np.concatenate([J, np.zeros((len(setup.held), *J.shape[1:]))])
     X = np.concatenate([response, own], -1)
-    free = np.r_[np.ones(count), np.full(own.shape[-1], 1e-6)]
+    free = np.r_[cost, np.full(own.shape[-1], 1e-6)]
     norm = np.sqrt((X[fitted] ** 2).mean((0, 1))) + 1e-12
     X = X / norm
     weight = best.fit.weights[:, None, None]  # as the named effects were fitted
@@ -73,8 +76,8 @@ def flexible_fit(
     return Flexible(setup.judged(by_parts(squares, setup.parts)), (w / norm)[:count], lam)
 
 
-def _features(setup: Setup, scales: dict[tuple[str, str], Scales], rng: np.random.Generator) -> Array:
-    """Forces of all features along the recorded motion, in N or N m times PUSH, [F, W, N, nj]."""
+def _features(setup: Setup, scales: dict[tuple[str, str], Scales], rng: np.random.Generator) -> tuple[Array, Array]:
+    """Forces of all features along the recorded motion, in N or N m times PUSH, [F, W, N, nj], and what each costs."""
     replayer = setup.problem.replayer
     w, joints = replayer.windows, replayer.plant.joints
     times = replayer.step_times()
@@ -84,27 +87,23 @@ def _features(setup: Setup, scales: dict[tuple[str, str], Scales], rng: np.rando
         mine = np.flatnonzero(w.episode == i)
         rows = np.clip(np.round(times[mine] / replayer.dt).astype(int), 0, len(s.q) - 1)
         q[mine], v[mine], u[mine] = s.q[rows], s.v[rows], replayer.episodes[i].ctrl[rows]
-    out = []
+    out: list[tuple[int, int, Array]] = []  # half waves over the range, joint, its force in typical ones
     for j, name in enumerate(joints):
         at = scales["joint", name]
-        force = PUSH * at.force
         x = np.stack([(q[..., j] - at.centre) / at.travel, v[..., j] / at.speed], -1)
-        for k in range(FEATURES):
-            spread = rng.choice([0.5, 1.0, 3.0, 8.0])
-            direction = rng.normal(size=2) * (spread, min(spread, 3.0))
-            if k % 4 == 0:
-                direction[1] = 0.0  # position alone: cogging, springs
-            f = np.cos(x @ direction + rng.uniform(0, 2 * np.pi))
-            if k % 4 == 1:
-                f = np.cos(x[..., 0] * direction[0] + rng.uniform(0, 2 * np.pi)) * np.tanh(3 * x[..., 1])
-            column = np.zeros((*times.shape, len(joints)))
-            column[..., j] = force * f
-            out.append(column)
-        for f in (np.tanh(10 * x[..., 1]), x[..., 1], np.tanh(x[..., 1])):
-            column = np.zeros((*times.shape, len(joints)))
-            column[..., j] = force * f
-            out.append(column)
-    return np.array(out)
+        along = np.pi * (q[..., j] - q[..., j].min()) / max(float(np.ptp(q[..., j])), 1e-9)
+        sense = np.tanh(3 * x[..., 1])
+        for k in range(1, WAVES + 1):
+            both = [wave(k * along) for wave in (np.cos, np.sin)]
+            out += [(k, j, f) for f in (both if k > RUBS else [*both, *(f * sense for f in both)])]
+        for _ in range(RANDOM):
+            direction = rng.normal(size=2) * rng.choice([0.5, 1.0, 3.0])
+            out.append((0, j, np.cos(x @ direction + rng.uniform(0, 2 * np.pi))))
+        out += [(0, j, f) for f in (np.tanh(10 * x[..., 1]), x[..., 1], np.tanh(x[..., 1]))]
+    forces = np.zeros((len(out), *times.shape, len(joints)))
+    for row, (_, j, f) in zip(forces, out, strict=True):
+        row[..., j] = PUSH * scales["joint", joints[j]].force * f
+    return forces, 1 + (np.array([k for k, _, _ in out]) / SMOOTH) ** 2
 
 
 def _solve(X: Array, r: Array, ridge: Array) -> Array:

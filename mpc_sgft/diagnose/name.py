@@ -126,7 +126,8 @@ def judge_entries(
     if left > max(NEAR, (1 - EXPLAINED) * (np.expm1(base.error) - 1.0)):
         reason = f"{_list(best)} leaves {times:.1f} times noise and floor, which no name in the library explains"
         return Verdict("unknown", best, [(e, "" if q is None else q.reason) for e, q in declared], probability, reason)
-    best, open_ties = canonical(best, declared)
+    first, (best, open_ties) = best, canonical(best, declared)
+    declared = [*declared, (first, equivalence(best, first))]  # where a convention prefers another
     named = [(e, "" if q is None else q.reason) for e, q in declared if e is not best]
     if open_ties:
         return Verdict("not_identifiable", best, named, probability, f"{_list(best)} and {len(open_ties)} others tie")
