@@ -5,6 +5,7 @@ So a new file in envs/effects/ is looked for at once; a row says more, such as w
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable
 from dataclasses import fields
@@ -35,14 +36,18 @@ def row_of(name: str) -> Row | None:
 @cache
 def _row(kind: type[Effect]) -> Row | None:
     """One parameter for each field, neutral at its default, as large as force, speed and travel make its unit."""
-    neutral = {f.name: f.default for f in fields(kind) if f.name != "at"}
-    sizes = {p: size_of(kind.units.get(p, "")) for p in neutral}
-    usable = all(isinstance(x, int | float) for x in neutral.values()) and None not in sizes.values()
-    if not usable or all(getattr(kind, hook) is getattr(Effect, hook) for hook in HOOKS):
+    if all(getattr(kind, hook) is getattr(Effect, hook) for hook in HOOKS):
         return None
-    low = {p: kind.bounds.get(p, (-float("inf"), 0.0))[0] for p in neutral}
-    starts = {p: (START,) if low[p] >= neutral[p] else (START, -START) for p in neutral}
-    return Row({p: Par(neutral[p], size, starts[p]) for p, size in sizes.items() if size})  # pyright: ignore[reportArgumentType]
+    parameters = {}
+    for f in fields(kind):
+        size, neutral = size_of(kind.units.get(f.name, "")), f.default
+        if f.name == "at":
+            continue
+        if size is None or not isinstance(neutral, int | float):
+            return None
+        one_sided = kind.bounds.get(f.name, (-math.inf, math.inf))[0] >= neutral
+        parameters[f.name] = Par(float(neutral), size, (START,) if one_sided else (START, -START))
+    return Row(parameters)
 
 
 def size_of(unit: str) -> Callable[[Scales], float] | None:
@@ -52,7 +57,7 @@ def size_of(unit: str) -> Callable[[Scales], float] | None:
         unit: Such as "N m s^2/rad^2 or N s^2/m^2"; the last one counts, and of angles alone, rad for m.
     """
     above, _, below = unit.split(" or ")[-1].partition("/")
-    power = dict.fromkeys(("N", "m", "s", "kg"), 0)
+    power: dict[str, int] = dict.fromkeys(("N", "m", "s", "kg"), 0)
     for part, sign in ((above, 1), (below, -1)):
         for factor in part.split():
             token = re.fullmatch(r"(N|m|rad|s|kg|1)(?:\^(\d))?", factor)

@@ -6,7 +6,7 @@
 | training_error  | the one effect that fits the training data best                                             |
 | bic             | forward selection of up to three effects while the Bayesian information criterion falls     |
 | all_at_once     | everything in one fit; what is more than two standard errors from zero is named             |
-| stlsq           | sequentially thresholded least squares, the sparse regression of SINDy                      |
+| pysindy         | sequentially thresholded least squares, the sparse regression of PySINDy                    |
 | network         | a small network explains the residual and names nothing                                     |
 
 Sources: S. Brunton, J. Proctor, J. Kutz, PNAS 113(15), 2016 (STLSQ); G. Schwarz, Ann. Statist. 6(2), 1978 (BIC).
@@ -20,8 +20,8 @@ import numpy as np
 from tools.blind.features import Motion, columns, read, uncertain
 from tools.blind.plants import Array
 
-THRESHOLD = 0.1  # of STLSQ, in standard deviations of the residual per standard deviation of a column
-RIDGE = 0.05  # of STLSQ (PySINDy's default), per sample of unit columns
+THRESHOLD = 0.1  # of PySINDy, in standard deviations of the residual per standard deviation of a column
+RIDGE = 0.05  # of PySINDy (its default), per sample of unit columns
 Library = dict[str, list[Array]]
 
 
@@ -43,8 +43,8 @@ def run(case: Path) -> dict[str, dict[str, Any]]:
     out["bic"] = report(_forward(r, library, train), r, library, train, ranked)
     out["all_at_once"] = report(_everything(r, library, train), r, library, train, ranked)
     names, flat = _flat(r, library, train)
-    kept = stlsq(flat[train], r[train], THRESHOLD, RIDGE)
-    out["stlsq"] = report(list(dict.fromkeys(n for n, k in zip(names, kept, strict=True) if k)), r, library, train)
+    kept = sparse(flat[train], r[train], THRESHOLD, RIDGE)
+    out["pysindy"] = report(list(dict.fromkeys(n for n, k in zip(names, kept, strict=True) if k)), r, library, train)
     out["network"] = {"verdict": "unknown", "effects": [], "candidates": [], "held_out_ratio": _network(motion, r)}
     return out
 
@@ -64,29 +64,21 @@ def report(labels: list[str], r: Array, library: Library, train: Array, ranked: 
     return {"verdict": verdict, "effects": effects, "candidates": first + rest, "held_out_ratio": ratio}
 
 
-def stlsq(a: Array, y: Array, threshold: float, ridge: float, rounds: int = 20) -> Array:
-    """Which columns survive, [K] of bool: ridge regression, drop small coefficients, repeat until nothing changes.
+def sparse(a: Array, y: Array, threshold: float, ridge: float) -> Array:
+    """Which columns survive PySINDy's sequentially thresholded least squares, [K] of bool.
 
     Args:
         a: Columns, [M, K]; scaled to unit root mean square here, as y is.
         y: What they explain, [M].
         threshold: Smallest coefficient that is kept, of scaled columns.
         ridge: Penalty on the squared coefficients, for columns of unit Euclidean length.
-        rounds: At most.
     """
-    rms = np.sqrt(np.mean(a**2, 0))
+    from pysindy.optimizers import STLSQ  # late: it takes seconds
+
+    rms, size = np.sqrt(np.mean(a**2, 0)), max(float(np.sqrt(np.mean(y**2))), 1e-30)
     scaled = a / np.where(rms > 0, rms, 1.0) / np.sqrt(len(a))
-    target = y / max(np.sqrt(np.mean(y**2)), 1e-30) / np.sqrt(len(y))
-    kept = rms > 0
-    for _ in range(rounds):
-        part = scaled[:, kept]
-        x = np.linalg.solve(part.T @ part + ridge * np.eye(part.shape[1]), part.T @ target)
-        new = kept.copy()
-        new[kept] = np.abs(x) >= threshold
-        if (new == kept).all() or not new.any():
-            return new
-        kept = new
-    return kept
+    fitted = STLSQ(threshold=threshold, alpha=ridge, max_iter=20).fit(scaled, (y / size / np.sqrt(len(y)))[:, None])
+    return np.abs(fitted.coef_[0]) > 0
 
 
 def _without(r: Array, library: Library, given: list[Array], train: Array) -> tuple[Array, Library]:
@@ -188,4 +180,4 @@ def _network(m: Motion, r: Array, steps: int = 300) -> float:
     return float(np.sqrt(np.mean(left**2) / max(np.mean(y[~m.train] ** 2), 1e-30)))
 
 
-NAMES = ("always_viscous", "training_error", "bic", "all_at_once", "stlsq", "network")
+NAMES = ("always_viscous", "training_error", "bic", "all_at_once", "pysindy", "network")

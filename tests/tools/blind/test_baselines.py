@@ -29,11 +29,11 @@ def write_case(folder: Path, **change: float) -> Path:
     return folder
 
 
-def test_stlsq_keeps_the_columns_that_matter() -> None:
+def test_sparse_regression_keeps_the_columns_that_matter() -> None:
     rng = np.random.default_rng(0)
     a = rng.standard_normal((500, 5))
     y = 2 * a[:, 1] - 3 * a[:, 4] + 0.01 * rng.standard_normal(500)
-    assert baselines.stlsq(a, y, 0.1, 1e-3).tolist() == [False, True, False, False, True]
+    assert baselines.sparse(a, y, 0.1, 1e-3).tolist() == [False, True, False, False, True]
 
 
 def test_the_residual_names_what_was_put_in(tmp_path: Path) -> None:
