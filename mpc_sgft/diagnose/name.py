@@ -117,11 +117,11 @@ def judge_entries(
         return Verdict("unknown", best, ties, probability, reason)
     times = np.sqrt(np.expm1(best.error))
     if not best.effects:
-        if settled(base):
-            reason = "the nominal model's error is within noise and the simulator's floor"
-            return Verdict("none", best, [], probability, reason)
-        reason = f"nothing explains the error, {times:.1f} times noise and floor, on windows that were not fitted"
-        return Verdict("unknown", best, [], probability, reason)
+        reason = "the nominal model's error is within noise and the simulator's floor"
+        if not settled(base):
+            tried = "no name" if flexible is None else "no name and no flexible model"
+            reason = f"{tried} explains the error, {times:.1f} times noise and floor, on windows that were not fitted"
+        return Verdict("none", best, [], probability, reason)
     left = np.expm1(best.error) - 1.0
     if left > max(NEAR, (1 - EXPLAINED) * (np.expm1(base.error) - 1.0)):
         reason = f"{_list(best)} leaves {times:.1f} times noise and floor, which no name in the library explains"

@@ -7,39 +7,19 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
-from scipy.io import loadmat
 
 from mpc_sgft.diagnose.fit import change_of, fit
 from mpc_sgft.diagnose.library import make_term
 from mpc_sgft.diagnose.nominal import nominal_terms
 from mpc_sgft.diagnose.plant import Plant
 from mpc_sgft.diagnose.prepare import prepare, scales
-from mpc_sgft.diagnose.record import Episode
-
-EMPS = """<mujoco><option timestep="0.001"/><worldbody><body name="carriage">
-<joint name="x" type="slide" axis="1 0 0"/><geom size="0.1" mass="95"/></body></worldbody>
-<actuator><motor name="motor" joint="x" gear="35.15"/></actuator></mujoco>"""
-HALF = 12420  # samples, 12.42 s
-
-
-def read(folder: Path, name: str, part: slice, called: str) -> Episode:
-    data = loadmat(folder / "emps" / f"{name}.mat")
-    q = np.asarray(data["qm"], float).ravel()[part]
-    return Episode(called, 0.001, np.asarray(data["vir"], float).reshape(-1, 1)[part], {"qpos/x": q})
-
-
-def thirds(folder: Path) -> list[Episode]:
-    return [
-        read(folder, "DATA_EMPS", slice(0, HALF), "first"),
-        read(folder, "DATA_EMPS", slice(HALF, None), "second"),
-        read(folder, "DATA_EMPS_PULSES", slice(None), "pulses"),
-    ]
+from tools import emps
 
 
 def test_asymmetric_viscous_and_coulomb_friction_predict_both_held_out_recordings(data_dir: Path) -> None:
-    plant = Plant(mujoco.MjSpec.from_string(EMPS))
+    plant = Plant(mujoco.MjSpec.from_string(emps.SCENE))
     nominal = nominal_terms(plant, {"mass": 0.3})
-    setup = prepare(plant, thirds(data_dir), nominal, window=0.5, signals=None, held_out=["second", "pulses"])
+    setup = prepare(plant, emps.thirds(data_dir), nominal, window=0.5, signals=None, held_out=["second", "pulses"])
     at = scales(plant, setup.problem.replayer)["joint", "x"]
     terms = [*nominal, *(make_term(plant, n, "x", at) for n in ("asymmetric_friction", "coulomb_friction"))]
     f = fit(setup.problem, terms, [*setup.baseline.values, *(t.starts[0] for t in terms[1:])], setup.fitted)
@@ -52,37 +32,33 @@ def test_asymmetric_viscous_and_coulomb_friction_predict_both_held_out_recording
     assert f.values[0][0] * 95 == pytest.approx(95.11, rel=0.03)
 
 
-def _verdict(folder: Path, episodes: list[Episode], spec: mujoco.MjSpec | None = None, **options: object) -> dict:
-    from mpc_sgft.diagnose.run import run
-
-    given = {"out": None, "effects": None, "signals": None, "window": None, "held_out": None, "seed": 0}
-    given |= {"uncertain": {"mass": 0.3}, "max_effects": 3, "progress": False} | options
-    return run(Plant(spec or mujoco.MjSpec.from_string(EMPS)), episodes, **given).as_dict()  # pyright: ignore
-
-
 @pytest.mark.slow
 def test_the_verdict_is_asymmetric_friction_with_coulomb(data_dir: Path) -> None:
-    report = _verdict(data_dir, thirds(data_dir), held_out=["second", "pulses"], window=0.5)
-    assert report["verdict"] == "effect", report["reason"]
-    assert {"asymmetric_friction", "coulomb_friction"} <= {e["name"] for e in report["effects"]}
-    wrong = {"stribeck_friction", "quadratic_drag", "actuator_delay"}
-    assert not wrong & {e["name"] for e in report["effects"]}
-    assert report["held_out"]["low"] > 0.9
+    report = emps.whole(data_dir)
+    assert report.verdict == "effect", report.data["reason"]
+    named = {e["name"] for e in report.data["effects"]}
+    assert {"asymmetric_friction", "coulomb_friction"} <= named  # published, with an offset of a fortieth of Coulomb's
+    assert named <= {"asymmetric_friction", "coulomb_friction", "actuator_offset"}  # no Stribeck, drag or delay
+    left = emps.errors(report)
+    assert left["second"] <= 0.30 and left["pulses"] <= 0.56, left  # mm
+    assert report.data["held_out"]["low"] > 0.9
 
 
 @pytest.mark.slow
 def test_two_seconds_are_too_little_for_a_confident_name(data_dir: Path) -> None:
-    report = _verdict(data_dir, [read(data_dir, "DATA_EMPS", slice(0, 2000), "short")])
-    known = {"viscous_friction", "coulomb_friction"}
-    assert report["verdict"] == "not_identifiable" or {e["name"] for e in report["effects"]} <= known
-    if report["verdict"] == "not_identifiable":
-        assert report["ties"] and report["next_experiment"]
+    report = emps.verdict([emps.read(data_dir, "DATA_EMPS", slice(0, emps.SHORT), "short")]).as_dict()
+    weaker = {"viscous_friction", "coulomb_friction"}
+    if report["verdict"] == "effect":
+        named = {e["name"] for e in report["effects"]}
+        assert named and named <= weaker
+        assert all(p["low"] < p["value"] < p["high"] for e in report["effects"] for p in e["parameters"].values())
+    else:
+        assert report["verdict"] == "not_identifiable" and report["ties"] and report["next_experiment"]
 
 
 @pytest.mark.slow
 def test_nothing_is_left_after_the_repair(data_dir: Path, tmp_path: Path) -> None:
-    whole = [read(data_dir, "DATA_EMPS", slice(0, HALF), "first")]
-    _verdict(data_dir, whole, out=tmp_path, effects=["asymmetric_friction", "coulomb_friction"])
-    repaired = mujoco.MjSpec.from_file(str(tmp_path / "repaired.xml"))
-    again = _verdict(data_dir, thirds(data_dir)[:2], repaired, held_out=["second"], uncertain={"mass": 0.05})
+    half = emps.thirds(data_dir)[:1]
+    emps.verdict(half, out=tmp_path, effects=["asymmetric_friction", "coulomb_friction"])
+    again = emps.split_after_repair(data_dir, tmp_path / "again", tmp_path / "repaired.xml").as_dict()
     assert again["verdict"] == "none", again["reason"]

@@ -12,6 +12,7 @@ from mpc_sgft.diagnose import screen as screening
 from mpc_sgft.diagnose import search as searching
 from mpc_sgft.diagnose.entry import Entry, entry
 from mpc_sgft.diagnose.fit import fit
+from mpc_sgft.diagnose.flexible import Flexible
 from mpc_sgft.diagnose.library import Term, as_gap, candidates, settings
 from mpc_sgft.diagnose.name import caution, gains, judge_entries
 from mpc_sgft.diagnose.plant import Change, Plant
@@ -111,14 +112,26 @@ def test_names_that_leave_much_of_an_error_are_no_answer(before: float, after: f
     assert [("hold a:" in note) for note in caution(verdict)] == [True] * (kind == "unknown")
 
 
-@pytest.mark.parametrize(("left", "kind"), [(1.1, "none"), (6.0, "unknown")])
-def test_an_error_that_nothing_explains_is_not_nothing(left: float, kind: str) -> None:
+@pytest.mark.parametrize(
+    ("left", "flexible", "kind", "words"),
+    [
+        (1.1, None, "none", "within noise"),
+        (6.0, None, "none", "no name explains the error"),
+        (6.0, 5.9, "none", "no name and no flexible model explains the error"),
+        (6.0, 2.0, "unknown", "a flexible residual model explains"),
+    ],
+)
+def test_an_error_is_unknown_if_a_flexible_model_explains_it(
+    left: float, flexible: float | None, kind: str, words: str
+) -> None:
     problem, fitted, none = Lines(), np.arange(18), np.zeros(1)
     setup = Setup(problem, fitted, np.arange(18, 24), fitted // 3, fit(problem, [], [], fitted), none, none)
     errors = np.log1p(left) + 0.01 * np.random.default_rng(0).normal(size=24)
     base = entry(setup, setup.baseline)._replace(errors=errors)
-    verdict = judge_entries(setup, [base], None, np.random.default_rng(0))
-    assert verdict.kind == kind and not verdict.best.effects and not caution(verdict)
+    model = None if flexible is None else Flexible(errors + np.log1p(flexible) - np.log1p(left), np.zeros(1), 1.0)
+    verdict = judge_entries(setup, [base], model, np.random.default_rng(0))
+    assert verdict.kind == kind and words in verdict.reason
+    assert not verdict.best.effects and not caution(verdict)
 
 
 def test_a_typical_size_is_no_larger_than_what_is_allowed() -> None:
