@@ -118,6 +118,7 @@ def assemble(
     shown = verdict.kind in ("effect", "not_identifiable")
     tied = [best, *(e for e, _ in verdict.ties)]
     names = [n for group in chain.groups.values() for n in group]
+    signals = held_out_rows(chain, both, setup, rng)
     data: dict[str, Any] = {
         "verdict": verdict.kind,
         "reason": verdict.reason,
@@ -130,7 +131,8 @@ def assemble(
         "next_experiment": next_experiment(chain, tied) if len(tied) > 1 else "",
         "nominal_refit": {},
         "where": where(chain, both),
-        "held_out": held_out_row(chain, both, setup, rng),
+        "held_out": signals[0],
+        "signals": signals,
         "noise_floor": {
             n: {"noise": float(a), "simulator": float(b)}
             for n, a, b in zip(names, setup.noise, setup.floor, strict=True)
@@ -172,15 +174,19 @@ def where(chain: Chain, both: Prediction) -> list[dict[str, Any]]:
     return sorted(rows, key=lambda row: -row["share_of_error"])
 
 
-def held_out_row(chain: Chain, both: Prediction, setup: Setup[Chain], rng: np.random.Generator) -> dict[str, Any]:
-    """The signal that is worst in units of its scale, on windows that were never fitted."""
+def held_out_rows(
+    chain: Chain, both: Prediction, setup: Setup[Chain], rng: np.random.Generator
+) -> list[dict[str, Any]]:
+    """Errors of every signal on windows that were never fitted, the worst in units of its scale first."""
     nominal, repaired = errors_of(chain, both)[:, setup.held]
     names = [n for group in chain.groups.values() for n in group]
     seen, joints = ((s**2).mean((0, 1)) for s in (chain.observation_scale, chain.joint_scale))
     scale = np.concatenate([seen, np.full(len(chain.groups["drive"]), chain.drive_scale**2), joints])
-    i = int(np.argmax(nominal.mean(0) / scale))
-    unit = {"observation": "of the observation", "drive": "of the control", "qpos": "rad"}[names[i].split("/")[0]]
-    return reduction(names[i], unit, nominal[:, i], repaired[:, i], rng)
+    units = {"observation": "of the observation", "drive": "of the control", "qpos": "rad"}
+    return [
+        reduction(names[i], units[names[i].split("/")[0]], nominal[:, i], repaired[:, i], rng)
+        for i in np.argsort(-nominal.mean(0) / scale)
+    ]
 
 
 def write(deployment: Deployment, best: Entry, out: Path) -> list[str]:

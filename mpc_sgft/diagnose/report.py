@@ -77,6 +77,11 @@ def page(report: Report) -> str:
         f"<td>{c['low']:.4g} to {c['high']:.4g}</td><td>{c['probability']:.0%}</td></tr>"
         for c in d["candidates"]
     )
+    signals = "".join(
+        f"<tr><td>{html.escape(s['signal'])}</td><td>{s['nominal']:.4g}</td><td>{s['repaired']:.4g} {s['unit']}</td>"
+        f"<td>{s['reduction']:.0%} [{s['low']:.0%}, {s['high']:.0%}]</td></tr>"
+        for s in d["signals"]
+    )
     where = "".join(
         f"<tr><td>{html.escape(w['signal'])}</td><td>{w['regime']}</td><td>{w['share_of_error']:.0%}</td>"
         f"<td>{w['share_of_time']:.0%}</td></tr>"
@@ -89,6 +94,8 @@ def page(report: Report) -> str:
         f"<img alt='measured, nominal and repaired' src='{figure(report)}'>"
         "<h2>Candidates</h2><p>Error of windows that were not fitted, in units of noise and simulator floor.</p>"
         f"<table><tr><th>effects<th>error<th>90 % interval<th>wins</tr>{rows}</table>"
+        "<h2>Signals</h2><p>Root mean square error on windows that were never fitted; 90 % interval of the drop.</p>"
+        f"<table><tr><th>signal<th>nominal<th>repaired<th>less</tr>{signals}</table>"
         f"<h2>Where</h2><table><tr><th>signal<th>regime<th>share of error<th>share of time</tr>{where}</table>"
         f"<h2>report.json</h2><details><pre>{html.escape(json.dumps(d, indent=2))}</pre></details>"
     )

@@ -122,6 +122,7 @@ def assemble(
     replayer = Replayer(plant, sharp.episodes, sharp.windows.samples * sharp.dt, sharp.signals)
     nominal, repaired = replayer.simulate([Change(), change_of(best.fit.terms, best.fit.values)])
     measured = replayer.windows.measured
+    signals = _signals(setup, nominal, repaired, measured, rng)
     shown = verdict.kind in ("effect", "not_identifiable")
     ties = [
         {"effects": e.names, "probability": verdict.probability[e.key], "held_out_error": e.error, "reason": reason}
@@ -137,7 +138,8 @@ def assemble(
         "next_experiment": next_experiment(setup, tied) if len(tied) > 1 else "",
         "nominal_refit": refit_table(list(base.terms), list(best.fit.values[: len(base.terms)])),
         "where": locate(setup),
-        "held_out": _held_out(setup, nominal, repaired, measured, rng),
+        "held_out": signals[0],
+        "signals": signals,
         "noise_floor": {
             name: {"noise": float(setup.noise[i]), "simulator": float(setup.floor[i])}
             for i, name in enumerate(replayer.signals)
@@ -205,23 +207,26 @@ def candidate_rows(
     return out
 
 
-def _held_out(
+def _signals(
     setup: Setup, nominal: Array, repaired: Array, measured: Array, rng: np.random.Generator
-) -> dict[str, Any]:
-    """Root mean square error of the signal that is worst in units of its noise, on windows that were never fitted."""
+) -> list[dict[str, Any]]:
+    """Errors of every signal on windows that were never fitted, the worst in units of its noise first."""
     held, problem = setup.held, setup.problem
     before, after = (((p - measured)[held] ** 2).mean(1) for p in (nominal, repaired))  # [W, S]
-    i = int(np.argmax(before.mean(0) / (problem.scale[held] ** 2).mean((0, 1))))
-    name = problem.replayer.signals[i]
-    plant = problem.replayer.plant
-    kind, part = name.split("/", 1)
-    unit = "1"
-    if kind in ("qpos", "qvel"):
-        slide = plant.model.joint(part).type[0] == int(mujoco.mjtJoint.mjJNT_SLIDE)
-        unit = ("m" if slide else "rad") + ("/s" if kind == "qvel" else "")
-    elif kind == "force":
-        unit = "N or N m"
-    return reduction(name, unit, before[:, i], after[:, i], rng)
+    worst = np.argsort(-before.mean(0) / (problem.scale[held] ** 2).mean((0, 1)))
+    names = problem.replayer.signals
+    units = [_unit(problem.replayer.plant, name) for name in names]
+    return [reduction(names[i], units[i], before[:, i], after[:, i], rng) for i in worst]
+
+
+def _unit(plant: Plant, signal: str) -> str:
+    kind, part = signal.split("/", 1)
+    if kind == "force":
+        return "N or N m"
+    if kind not in ("qpos", "qvel"):
+        return "1"
+    slide = plant.model.joint(part).type[0] == int(mujoco.mjtJoint.mjJNT_SLIDE)
+    return ("m" if slide else "rad") + ("/s" if kind == "qvel" else "")
 
 
 def reduction(signal: str, unit: str, before: Array, after: Array, rng: np.random.Generator) -> dict[str, Any]:
