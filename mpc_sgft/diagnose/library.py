@@ -216,6 +216,13 @@ def includes(rich: Term, simple: Term) -> bool:
     return simple.effect in INCLUDES.get(rich.effect, {}) and simple.at == rich.at
 
 
+def simplify(rich: Term, value: Array, simple: Term) -> Array:
+    """Parameters with which the simpler effect comes nearest to what the richer one does."""
+    mapping = INCLUDES[rich.effect][simple.effect]
+    shares = [[value[i] for i, name in enumerate(rich.names) if mapping.get(name) == p] for p in simple.names]
+    return np.clip([float(np.mean(x)) for x in shares], simple.low, simple.high)
+
+
 def enrich(rich: Term, simple: Term, value: Array) -> list[Array]:
     """Parameters with which the richer effect does what the simpler one does, for each start of those that idle."""
     mapping = INCLUDES[rich.effect][simple.effect]

@@ -12,7 +12,7 @@ from mpc_sgft.diagnose import judge
 from mpc_sgft.diagnose.entry import Entry, entry
 from mpc_sgft.diagnose.fit import fit
 from mpc_sgft.diagnose.flexible import Flexible
-from mpc_sgft.diagnose.library import HIDDEN
+from mpc_sgft.diagnose.library import HIDDEN, includes
 from mpc_sgft.diagnose.prepare import ABOVE_NOISE, NOISE, Setup
 from mpc_sgft.diagnose.record import Array
 from mpc_sgft.diagnose.table import EQUIVALENT, Equivalence
@@ -143,11 +143,20 @@ def caution(verdict: Verdict) -> list[str]:
 
 
 def find_ties(setup: Setup[Any], best: Entry, entries: list[Entry], rng: np.random.Generator) -> list[Entry]:
-    """Other sets of no more names and parameters than the best that are not credibly worse, best first."""
+    """Other sets of no more names and parameters than the best that are not credibly worse, best first.
+
+    Not those that hold the best, and can do all that it does: a richer effect must gain something.
+    """
     rivals = [e for e in entries if 0 < e.effects <= best.effects and 0 < e.complexity and no_larger(e, best)]
-    other = [e for e in rivals if sorted(e.names) != sorted(best.names)]
+    other = [e for e in rivals if sorted(e.names) != sorted(best.names) and not holds(e, best)]
     tied = [e for e in other if not judge.worse(e.errors, best.errors, rng, odds(setup, best, e))]
     return sorted(tied, key=lambda e: e.error)
+
+
+def holds(rich: Entry, simple: Entry) -> bool:
+    """Whether one set is the other with an effect in place of a simpler one that it includes."""
+    more, less = ([t for t in a.terms if t.label not in b.names] for a, b in ((rich, simple), (simple, rich)))
+    return len(more) == len(less) == 1 and includes(more[0], less[0])
 
 
 def no_larger(e: Entry, best: Entry) -> bool:

@@ -10,10 +10,11 @@ import numpy as np
 from mpc_sgft.diagnose import judge
 from mpc_sgft.diagnose.entry import Entry, entry
 from mpc_sgft.diagnose.fit import fit, robust, typical
-from mpc_sgft.diagnose.library import Term
+from mpc_sgft.diagnose.library import Term, includes, simplify
 from mpc_sgft.diagnose.prepare import Setup
+from mpc_sgft.diagnose.record import Array
 from mpc_sgft.diagnose.screen import Effort, couple, key_of, proposals, screen, sharpen
-from mpc_sgft.diagnose.table import ALIKE
+from mpc_sgft.diagnose.table import ALIKE, EQUIVALENT
 
 FIRST, NEXT = (1.0, 0.1, 0.01), (0.3,)  # how far from no effect the fits of a first effect start, and of further ones
 REJUDGED = 6  # sets that are judged anew
@@ -116,19 +117,31 @@ def again(setup: Setup[Any], entries: Sequence[Entry], best: Entry) -> list[Entr
 def swaps(
     setup: Setup[Any], found: dict[frozenset[str], Entry], terms: Sequence[Term], effort: Effort
 ) -> dict[frozenset[str], Entry]:
-    """The best sets with one effect exchanged for one that does much the same with the same number.
+    """The best sets with one effect exchanged: for a simpler one that it holds, one that does much the same with the
+    same number, for the usual name of the same term.
 
-    Rivals this near must not lose because their fit began elsewhere.
+    Rivals this near must not lose because their fit began elsewhere, or never began.
     """
     out: dict[frozenset[str], Entry] = {}
     for e in sorted(found.values(), key=lambda e: e.error)[:SWAPPED]:
-        for i, old in enumerate(e.fit.terms):
-            there = {t.label for t in e.terms}
-            alike = (t for t in terms if t.at == old.at and {t.effect, old.effect} in ALIKE)
-            for new in (t for t in alike if t.label not in there):
+        first, there = len(e.fit.terms) - e.effects, {t.label for t in e.terms}
+        for i, old in enumerate(e.terms, first):
+            for new in (t for t in terms if t.label not in there):
                 changed = (*e.fit.terms[:i], new, *e.fit.terms[i + 1 :])
-                other = entry(setup, fit(setup.problem, changed, e.fit.values, setup.fitted, effort.last))
-                before = found.get(other.key)
-                if before is None or other.error < before.error:
-                    out[other.key] = other
+                for start in _instead(old, e.fit.values[i], new):
+                    values = [*e.fit.values[:i], start, *e.fit.values[i + 1 :]]
+                    other = entry(setup, fit(setup.problem, changed, values, setup.fitted, effort.last))
+                    before = out.get(other.key, found.get(other.key))
+                    if before is None or other.error < before.error:
+                        out[other.key] = other
     return out
+
+
+def _instead(old: Term, value: Array, new: Term) -> list[Array]:
+    """Where to start with one effect in place of another; nowhere if that is not worth a try."""
+    if includes(old, new):
+        return [simplify(old, value, new)]
+    if new.at == old.at and {new.effect, old.effect} in ALIKE:
+        return [value]
+    usual = (q for q in EQUIVALENT if q.canonical == new.effect and old.effect in q.effects)
+    return list(new.starts) if any(usual) else []

@@ -68,7 +68,7 @@ TABLE: dict[str, Row] = {
     "joint_stiffness": Row(
         {
             "stiffness": Par(0.0, lambda s: s.force / s.travel),
-            "rest": Par(lambda s: s.centre, lambda s: s.travel, (0.0,), -5.0, 5.0),
+            "rest": Par(lambda s: s.centre, lambda s: s.travel, (0.0, -3.0, 3.0), -5.0, 5.0),
         }
     ),
     "armature": Row({"inertia": Par(0.0, lambda s: s.inertia)}),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import mujoco
 import numpy as np
@@ -13,8 +14,8 @@ from mpc_sgft.diagnose import search as searching
 from mpc_sgft.diagnose.entry import Entry, entry
 from mpc_sgft.diagnose.fit import fit
 from mpc_sgft.diagnose.flexible import Flexible
-from mpc_sgft.diagnose.library import Term, as_gap, candidates, settings
-from mpc_sgft.diagnose.name import caution, gains, judge_entries
+from mpc_sgft.diagnose.library import Term, as_gap, candidates, settings, simplify
+from mpc_sgft.diagnose.name import caution, gains, holds, judge_entries
 from mpc_sgft.diagnose.plant import Change, Plant
 from mpc_sgft.diagnose.prepare import NOISE, Setup
 from mpc_sgft.diagnose.screen import Effort
@@ -73,6 +74,27 @@ def test_a_delay_is_exchanged_for_a_lag_but_not_where_there_is_one() -> None:
     alone, both = (entry(setup, fit(problem, t, [none] * len(t), fitted)) for t in (terms[:1], terms))
     assert [e.names for e in swaps(setup, {alone.key: alone}, terms, Effort()).values()] == [["actuator_lag"]]
     assert not swaps(setup, {both.key: both}, terms, Effort())
+
+
+def test_a_simpler_effect_and_the_usual_name_of_a_term_are_tried_in_place_of_what_is_there() -> None:
+    problem, fitted, none = Lines(), np.arange(18), np.zeros(1)
+    terms = [term("viscous_friction"), term("actuator_offset"), term("gravity_tilt")]
+    problem.columns |= dict.fromkeys(("viscous_friction", "asymmetric_friction"), problem.columns["x"])
+    problem.columns |= dict.fromkeys(("actuator_offset", "gravity_tilt"), problem.columns["y"])
+    both = np.ones(2)
+    rich = replace(
+        term("asymmetric_friction"), names=("forward", "backward"), neutral=0 * both, low=-50 * both, high=50 * both,
+        size=both, starts=(both,),
+    )  # fmt: skip
+    simple = replace(terms[0], names=("coefficient",))
+    assert simplify(rich, np.array([2.0, 4.0]), simple).tolist() == [3.0]
+    setup = Setup(problem, fitted, np.arange(18, 24), fitted // 3, fit(problem, [], [], fitted), none, none, np.log1p)
+    start = entry(setup, fit(problem, [rich, terms[2]], [both, none], fitted, 0))
+    found = swaps(setup, {start.key: start}, [simple, *terms[1:]], Effort()).values()
+    names = [e.names for e in found]
+    assert names == [["viscous_friction", "gravity_tilt"], ["asymmetric_friction", "actuator_offset"]]
+    assert all(e.error < NOISE + 0.1 for e in found if e.names[0] == "viscous_friction")
+    assert holds(start, next(iter(found))) and not holds(next(iter(found)), start) and not holds(start, start)
 
 
 def test_where_noise_alone_is_left_an_effect_must_gain_more() -> None:
