@@ -122,27 +122,35 @@ def screen(
     problem, pick, scale = setup.problem, _spread(setup.fitted, windows), typical(parent.fit.r)
     looks = [look(setup, parent, option, pick) for option in options]
     before = float(robust(parent.fit.r[np.searchsorted(setup.fitted, pick)], scale))
-    for last in {x.option.terms[x.option.new].label: x for x in looks}.values():  # its smallest start
+    for last in {_aside(x.option): x for x in looks}.values():  # the smallest start
         for _ in range(SHRINKS):
             if last.here < before + TOO_MUCH:
                 break
             terms, start, new = last.option
             less = [*start[:new], smaller(terms[new], start[new], 0.1), *start[new + 1 :]]
             looks.append(last := look(setup, parent, Option(terms, less, new), pick))
-    best: dict[Any, Look] = {}
+    by_set: dict[Any, list[Look]] = {}
     for x in looks:
         richer = x.option.new < len(parent.fit.terms)
         key = key_of(setup, x.option.terms), tuple(x.option.start[x.option.new]) if richer else ()
-        if x.sample is not None and (key not in best or x.there < best[key].there):
-            best[key] = x
+        if x.sample is not None:
+            by_set.setdefault(key, []).append(x)
     out = []
-    for (_, richer), x in best.items():
+    for (_, richer), mine in by_set.items():
+        x, y = min(mine, key=lambda x: x.there), min(mine, key=lambda x: x.here)  # derivatives may promise too much
         own = Proposal(x.option.terms, tuple(x.option.start), x.here)
         costs = robust(problem.residuals(own.terms, x.tries, pick), scale)
         reached = [Proposal(own.terms, tuple(t), float(c)) for t, c in zip(x.tries, costs, strict=True)]
-        first = min([own, *reached], key=lambda p: p.cost)
+        stay = Proposal(y.option.terms, tuple(y.option.start), y.here)
+        first = min([own, *reached, stay], key=lambda p: p.cost)
         out.append(own._replace(cost=first.cost) if richer else first)
     return sorted(out, key=lambda p: p.cost), [x.sample for x in looks if x.sample is not None]
+
+
+def _aside(option: Option) -> tuple[str, ...]:
+    """An effect, and what its start says of parameters that mean nothing while it is neutral."""
+    term, start = option.terms[option.new], option.start[option.new]
+    return term.label, *(f"{n}={x:g}" for n, x in zip(term.names, start, strict=True) if n in HIDDEN)
 
 
 def look(setup: Setup[Any], parent: Entry, option: Option, pick: Index) -> Look:

@@ -73,3 +73,35 @@ def test_every_effect_of_a_set_counts_however_much_another_shows() -> None:
     J = np.stack([1e6 * problem.column[:18], problem.column[18:].repeat(3, 0)], -1)
     both = Fit((term("a"), term("b")), (np.array([TRUE]), np.zeros(1)), base.r, J)
     assert entry(setup, both).complexity == 2
+
+
+class Spring:
+    """r = k (q - rest) - y: a stiffness far below its typical size, at rest far from the motion."""
+
+    blocks, step, pattern = 20, 1e-2, ()
+
+    def __init__(self) -> None:
+        rng = np.random.default_rng(0)
+        self.q = rng.normal(size=(24, 20))
+        self.y = 1e4 * TRUE * (self.q + 2.5) + 0.3 * rng.normal(size=self.q.shape)
+
+    def residuals(self, terms: Sequence[Term], points: Sequence[Sequence[np.ndarray]], pick: np.ndarray) -> np.ndarray:
+        springs = [p[0] if len(p) else (0.0, 0.0) for p in points]
+        return np.stack([(1e4 * k * (self.q - rest) - self.y)[pick] for k, rest in springs])
+
+
+def test_every_rest_of_a_spring_is_tried_with_small_stiffness() -> None:
+    """From rest in the middle derivatives promise most, and lead nowhere."""
+    one, both = np.ones(1), np.ones(2)
+    starts = tuple(np.array([0.1, rest]) for rest in (0.0, -3.0, 3.0))
+    spring = Term(
+        "joint_stiffness", (), ("stiffness", "rest"), ("1", "1"), 0 * both, np.array([0, -5.0]), np.array([50, 5.0]),
+        both, starts, lambda x: Change(),
+    )  # fmt: skip
+    problem, fitted, none = Spring(), np.arange(18), 0 * one
+    base = fit(problem, [], [], fitted)
+    setup = Setup(problem, fitted, np.arange(18, 24), fitted // 3, base, none, none, np.log1p)
+    parent = entry(setup, base)
+    ranked, _ = screen(setup, parent, proposals(parent, [spring], 1, (1.0, 0.1, 0.01)), 6)
+    k, rest = ranked[0].start[0]
+    assert rest < -1.5 and 0.3 < k / TRUE < 3
