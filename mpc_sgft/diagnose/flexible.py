@@ -18,7 +18,7 @@ from mpc_sgft.diagnose.prepare import Setup
 from mpc_sgft.diagnose.record import Array, Index
 from mpc_sgft.diagnose.table import Scales
 
-WAVES, RUBS, RANDOM = 16, 4, 12  # per joint: over the position, the same times the direction, of position and speed
+WAVES, RUBS, RANDOM = 12, 3, 12  # per joint: over the position, the same times the direction, of position and speed
 SMOOTH = 4.0  # half waves over the range of the motion, from where on they cost more
 PUSH = 0.01  # of the typical force, to differentiate
 RIDGES = np.logspace(-6, 3, 10)

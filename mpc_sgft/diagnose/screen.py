@@ -119,7 +119,7 @@ def screen(
 ) -> tuple[list[Proposal], list[Sample]]:
     """Order options by their error after one Gauss-Newton step: of each set the most promising start, of one in which
     an effect becomes a richer one every start, as it is."""
-    problem, pick, scale = setup.problem, _spread(setup.fitted, windows), typical(parent.fit.r)
+    problem, pick, scale = setup.problem, spread(setup.fitted, windows), typical(parent.fit.r)
     looks = [look(setup, parent, option, pick) for option in options]
     before = float(robust(parent.fit.r[np.searchsorted(setup.fitted, pick)], scale))
     for last in {_aside(x.option): x for x in looks}.values():  # the smallest start
@@ -188,7 +188,7 @@ def couple(parent: Entry, samples: list[Sample], setup: Setup[Any], effort: Effo
 
     The residuals of two effects are taken for the nominal model's, moved by the one and by the other: no simulation.
     """
-    rows = np.searchsorted(setup.fitted, _spread(setup.fitted, effort.screen))
+    rows = np.searchsorted(setup.fitted, spread(setup.fitted, effort.screen))
     r0, J0 = parent.fit.r[rows], parent.fit.J[rows]
     root = np.sqrt(weights(r0))[:, None, None]
     parts = [r0[..., None], J0, *(x for s in samples for x in (s.moved[..., None], s.J))]
@@ -230,7 +230,7 @@ def _overlap(a: Term, b: Term) -> bool:
 
 def sharpen(setup: Setup[Any], ranked: list[Proposal], effort: Effort) -> list[Proposal]:
     """Order proposals anew after a few iterations on some windows: one step says little of some effects."""
-    pick, out = _spread(setup.fitted, effort.sharpen), []
+    pick, out = spread(setup.fitted, effort.sharpen), []
     scale = typical(setup.baseline.r)
     for p in ranked:
         f = fit(setup.problem, p.terms, p.start, pick, effort.quick)
@@ -251,5 +251,6 @@ def _moved(terms: Sequence[Term], start: Sequence[Array], new: int, step: Array,
     return out
 
 
-def _spread(windows: Index, count: int) -> Index:
+def spread(windows: Index, count: int) -> Index:
+    """So many of the windows, from first to last."""
     return windows[np.unique(np.linspace(0, len(windows) - 1, min(count, len(windows))).astype(int))]

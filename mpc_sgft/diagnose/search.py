@@ -13,11 +13,12 @@ from mpc_sgft.diagnose.fit import fit, robust, typical
 from mpc_sgft.diagnose.library import Term, includes, simplify
 from mpc_sgft.diagnose.prepare import Setup
 from mpc_sgft.diagnose.record import Array
-from mpc_sgft.diagnose.screen import Effort, couple, key_of, proposals, screen, sharpen
+from mpc_sgft.diagnose.screen import Effort, couple, key_of, proposals, screen, sharpen, spread
 from mpc_sgft.diagnose.table import ALIKE, EQUIVALENT
 
 FIRST, NEXT = (1.0, 0.1, 0.01), (0.3,)  # how far from no effect the fits of a first effect start, and of further ones
 REJUDGED = 6  # sets that are judged anew
+HOPELESS = 3.0  # times the error of a set, after a few iterations on some windows: no full fit
 SWAPPED = 2  # of the best sets, in which effects are exchanged for those that start well where they end
 
 
@@ -107,7 +108,7 @@ def again(setup: Setup[Any], entries: Sequence[Entry], best: Entry) -> list[Entr
         best: One of them.
     """
     rivals = sorted((e for e in entries[1:] if e.effects <= best.effects), key=lambda e: e.error)[:REJUDGED]
-    larger = sorted((e for e in entries[1:] if e.effects > best.effects), key=lambda e: e.error)[: REJUDGED // 2]
+    larger = sorted((e for e in entries[1:] if e.effects > best.effects), key=lambda e: e.error)[: REJUDGED // 3]
     parts = [e for e in entries[1:] if e.key < best.key]
     kept = {e.key: e for e in [best, *rivals, *parts, *larger]}
     fits = (fit(setup.problem, e.fit.terms, e.fit.values, setup.fitted) for e in kept.values())
@@ -123,14 +124,19 @@ def swaps(
     Rivals this near must not lose because their fit began elsewhere, or never began.
     """
     out: dict[frozenset[str], Entry] = {}
+    pick, scale = spread(setup.fitted, effort.sharpen), typical(setup.baseline.r)
     for e in sorted(found.values(), key=lambda e: e.error)[:SWAPPED]:
+        enough = HOPELESS * robust(e.fit.r[np.searchsorted(setup.fitted, pick)], scale)
         first, there = len(e.fit.terms) - e.effects, {t.label for t in e.terms}
         for i, old in enumerate(e.terms, first):
             for new in (t for t in terms if t.label not in there):
                 changed = (*e.fit.terms[:i], new, *e.fit.terms[i + 1 :])
                 for start in _instead(old, e.fit.values[i], new):
                     values = [*e.fit.values[:i], start, *e.fit.values[i + 1 :]]
-                    other = entry(setup, fit(setup.problem, changed, values, setup.fitted, effort.last))
+                    quick = fit(setup.problem, changed, values, pick, effort.quick)
+                    if robust(quick.r, scale) > enough:
+                        continue
+                    other = entry(setup, fit(setup.problem, changed, quick.values, setup.fitted, effort.last))
                     before = out.get(other.key, found.get(other.key))
                     if before is None or other.error < before.error:
                         out[other.key] = other
