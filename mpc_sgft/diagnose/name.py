@@ -128,7 +128,10 @@ def judge_entries(
         return Verdict("unknown", best, [(e, "" if q is None else q.reason) for e, q in declared], probability, reason)
     first, (best, open_ties) = best, canonical(best, declared)
     declared = [*declared, (first, equivalence(best, first))]  # where a convention prefers another
-    named = [(e, "" if q is None else q.reason) for e, q in declared if e is not best]
+    named: list[tuple[Entry, str]] = []
+    for e, q in declared:  # each set of names once: the best of those that differ in what is held
+        if sorted(e.names) not in [sorted(other.names) for other in (best, *(t for t, _ in named))]:
+            named.append((e, "" if q is None else q.reason))
     if open_ties:
         return Verdict("not_identifiable", best, named, probability, f"{_list(best)} and {len(open_ties)} others tie")
     return Verdict("effect", best, named, probability, f"no larger set is credibly better than {_list(best)}")

@@ -57,6 +57,12 @@ def slide_data(
 
 
 @pytest.fixture
+def moved() -> Callable[..., dict[str, np.ndarray]]:
+    """`slide_data`: columns of an episode of the slide."""
+    return slide_data
+
+
+@pytest.fixture
 def slide(tmp_path: Path) -> Path:
     path = tmp_path / "slide.xml"
     path.write_text(SLIDE)

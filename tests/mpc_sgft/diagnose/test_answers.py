@@ -12,8 +12,8 @@ import pytest
 from mpc_sgft.diagnose import diagnose
 from mpc_sgft.diagnose.__main__ import main
 from mpc_sgft.diagnose.record import write_csv
-from tests.mpc_sgft.diagnose.conftest import GEAR, slide_data
 
+GEAR = 10.0  # of the slide's motor
 Record = Callable[..., Path]
 Check = Callable[[dict], None]
 
@@ -44,9 +44,9 @@ def test_the_command_line_writes_a_whole_report(
 
 
 def test_one_term_of_the_equations_ties_and_a_measured_force_vetoes(
-    slide: Path, tmp_path: Path, check_report: Check
+    slide: Path, moved: Callable, tmp_path: Path, check_report: Check
 ) -> None:
-    columns, rng = slide_data(5.0, mass=6.0), np.random.default_rng(0)
+    columns, rng = moved(5.0, mass=6.0), np.random.default_rng(0)
     write_csv(tmp_path / "blind.csv", columns)
     force = GEAR * columns["ctrl/motor"] + 0.01 * rng.standard_normal(len(columns["time"]))
     write_csv(tmp_path / "felt.csv", columns | {"force/motor": force})

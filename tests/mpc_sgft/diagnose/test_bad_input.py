@@ -13,7 +13,6 @@ from mpc_sgft.diagnose.check import episodes
 from mpc_sgft.diagnose.plant import Axis, load_plant
 from mpc_sgft.diagnose.record import Table, files, read_table, write_csv
 from mpc_sgft.errors import UserError
-from tests.mpc_sgft.diagnose.conftest import slide_data
 
 CHIRP = np.sin(1e-3 * np.arange(209) ** 2)
 RANGES = {"x": Axis(-2.0, 2.0, slide=True)}
@@ -220,9 +219,9 @@ def test_models_that_do_not_load(tmp_path: Path) -> None:
     ],
 )
 def test_settings_that_cannot_be(
-    args: str, words: str, slide: Path, tmp_path: Path, capsys: pytest.CaptureFixture
+    args: str, words: str, slide: Path, moved: Callable, tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
-    columns = slide_data(1.0)
+    columns = moved(1.0)
     write_csv(tmp_path / "a.csv", columns | {"sensor/current": columns["ctrl/motor"]})
     answer = main(["--model", str(slide), "--data", str(tmp_path / "a.csv"), "--out", str(tmp_path), *args.split()])
     assert answer == 2 and words in capsys.readouterr().err
