@@ -95,8 +95,9 @@ def default_signals(episodes: Sequence[Episode], plant: Plant) -> list[str]:
     Velocities only start the windows.
     """
     has = [n for n in episodes[0].signals if all(n in e.signals for e in episodes)]
-    forces = [n for n in has if n.startswith("force/")]
-    return [n for n in has if n.startswith("qpos/")] + forces + [n for n in has if n[7:] in plant.sensors()]
+    sensors = [f"sensor/{name}" for name in plant.sensors()]
+    positions, forces = ([n for n in has if n.startswith(kind)] for kind in ("qpos/", "force/"))
+    return positions + forces + [n for n in has if n in sensors]
 
 
 def prepare(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import pytest
 
@@ -16,8 +17,8 @@ from mpc_sgft.diagnose.entry import Entry, entry
 from mpc_sgft.diagnose.fit import fit
 from mpc_sgft.diagnose.library import make_term
 from mpc_sgft.diagnose.plant import Plant, load_plant
-from mpc_sgft.diagnose.prepare import Problem, Setup, around, prepare, scales
-from mpc_sgft.diagnose.record import read_table
+from mpc_sgft.diagnose.prepare import Problem, Setup, around, default_signals, prepare, scales
+from mpc_sgft.diagnose.record import Episode, read_table
 
 
 @pytest.fixture
@@ -71,3 +72,11 @@ def test_long_steps_search_where_noise_hides_their_error_and_short_ones_judge(
     report = diagnose(slide, [record(seconds=8.0, viscous=2.0, noise=noise)], effects=["viscous_friction"])
     assert report.as_dict()["verdict"] == "effect"
     assert steps["search"][0] == pytest.approx(searched) and steps["again"] == pytest.approx([5e-4])
+
+
+def test_sensors_of_the_scene_are_compared_too_and_nothing_that_only_ends_like_one() -> None:
+    scene = """<mujoco><worldbody><body><joint name="x" type="slide"/><geom size="0.1" mass="1"/></body></worldbody>
+    <actuator><motor name="m" joint="x"/></actuator><sensor><jointpos name="tip" joint="x"/></sensor></mujoco>"""
+    names = ["qpos/x", "qvel/x", "qvel/x-tip", "force/m", "sensor/tip", "sensor/heat"]
+    episode = Episode("a", 0.01, np.zeros((9, 1)), {n: np.zeros(9) for n in names})
+    assert default_signals([episode], Plant(mujoco.MjSpec.from_string(scene))) == ["qpos/x", "force/m", "sensor/tip"]
