@@ -32,7 +32,7 @@ from mpc_sgft.log import progress as bar_of
 
 LENGTH = 6  # control steps in a window
 MOST = 64  # windows
-EFFORT = Effort(beam=(2,), full=(5, 4, 3), screen=16, sharpen=16, enough=1.0, pairs=0)
+EFFORT = Effort(beam=(2,), full=(5, 4, 3), screen=16, sharpen=16, enough=1.0, pairs=0, exchange=0)
 
 
 def diagnose_run(

@@ -17,6 +17,8 @@ TIE_ODDS = 20.0  # ... or be so much less likely, where what is left is noise
 FEW = 12  # windows
 MIN_GAIN = 0.05  # in log(1 + e): a gain below is not worth a name ...
 MIN_SHARE = 0.05  # ... nor one below this share of the error
+NEAR = 1.0  # in squares of noise: less above it is not much, whatever its share
+ELSEWHERE_SHARE = 0.4  # of the gain that matters, or
 ELSEWHERE = 0.02  # in log(1 + e), left of a gain without its best window: one window may have gone wrong by itself
 
 
@@ -52,12 +54,22 @@ def worth(error: float) -> float:
     return max(MIN_GAIN, MIN_SHARE * error)
 
 
+def leaves(error: float, nominal: float, share: float) -> bool:
+    """Whether a set leaves more than this share of the nominal model's squared error above noise, and enough to matter.
+
+    Args:
+        error, nominal: Of the set and of the nominal model, in log(1 + e).
+        share: 0…1.
+    """
+    return bool(np.expm1(error) - 1 > max(NEAR, share * (np.expm1(nominal) - 1)))
+
+
 def credible(
     worse: Array,
     better: Array,
     rng: np.random.Generator,
     parts: int = 1,
-    least: float = MIN_GAIN,
+    least: float | None = None,
     one_window: bool = False,
 ) -> bool:
     """Whether the gain is real, in more than one window, and large enough to matter.
@@ -66,13 +78,14 @@ def credible(
         worse, better: Errors of the same parts of the same windows, [W parts].
         rng: For the bootstrap.
         parts: Of each window.
-        least: Gain that matters.
+        least: Gain that matters, in log(1 + e); what is worth a name if None.
         one_window: Whether several parts of one window will do.
     """
     g = gain(worse, better, 2 * GAIN_LEVEL - 1, rng)
     drops = (worse - better).reshape(-1, 1 if one_window else parts).mean(1)
     elsewhere = (drops.sum() - drops.max()) / max(len(drops) - 1, 1)
-    return g.low > 0 and g.mean > max(least, worth(float(worse.mean()))) and bool(elsewhere > ELSEWHERE)
+    least = worth(float(worse.mean())) if least is None else least
+    return g.low > 0 and g.mean > least and bool(elsewhere > min(ELSEWHERE, ELSEWHERE_SHARE * least))
 
 
 def worse(rival: Array, best: Array, rng: np.random.Generator, odds: float = 0.0) -> bool:

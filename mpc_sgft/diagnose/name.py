@@ -18,10 +18,10 @@ from mpc_sgft.diagnose.record import Array
 from mpc_sgft.diagnose.table import EQUIVALENT, Equivalence
 
 UNEXPLAINED = 0.05  # share of what any model can explain that named effects may miss before the answer is "unknown"
+FIRST_GAIN = 0.025  # in log(1 + e), of the only effect where the nominal model leaves noise alone
 NEXT_GAIN = 0.06  # in log(1 + e), of one more effect where noise alone is left
 WIDER = 1.3  # of intervals: what windows that begin at each other's ends share; set on development seeds
-EXPLAINED = 0.85  # share of the squared error above noise that names must explain ...
-NEAR = 1.0  # ... unless they leave no more than this, in squares of noise
+LEFT = 0.1  # share of the squared error above noise that names may leave
 
 
 class Verdict(NamedTuple):
@@ -58,8 +58,11 @@ def choose(setup: Setup[Any], entries: list[Entry], rng: np.random.Generator) ->
 
 def gains(setup: Setup[Any], small: Entry, large: Entry, rng: np.random.Generator) -> bool:
     """Whether a larger set is credibly better; where noise alone is left, one more effect must gain more."""
-    noise_alone = small.error < setup.quiet or bool(small.effects) and settled(small)
-    least = NEXT_GAIN if noise_alone else judge.MIN_GAIN
+    least = judge.worth(small.error)
+    if small.effects and settled(small):
+        least = NEXT_GAIN
+    elif not small.effects and small.error < setup.quiet:
+        least = FIRST_GAIN
     return judge.credible(small.errors, large.errors, rng, setup.parts, least, setup.one_window(large.errors))
 
 
@@ -122,8 +125,7 @@ def judge_entries(
             tried = "no name" if flexible is None else "no name and no flexible model"
             reason = f"{tried} explains the error, {times:.1f} times noise and floor, on windows that were not fitted"
         return Verdict("none", best, [], probability, reason)
-    left = np.expm1(best.error) - 1.0
-    if left > max(NEAR, (1 - EXPLAINED) * (np.expm1(base.error) - 1.0)):
+    if judge.leaves(best.error, base.error, LEFT):
         reason = f"{_list(best)} leaves {times:.1f} times noise and floor, which no name in the library explains"
         return Verdict("unknown", best, [(e, "" if q is None else q.reason) for e, q in declared], probability, reason)
     first, (best, open_ties) = best, canonical(best, declared)

@@ -27,6 +27,7 @@ class Effort(NamedTuple):
         quick, last: Iterations of a quick fit, and of the full one that goes on from it.
         enough: Pairs are tried although no effect alone gains, if the error is above this.
         pairs: Of those that the screened effects make, how many get a quick fit.
+        exchange: Full fits with one effect of a set that leaves much replaced by another; 0 for no such exchange.
     """
 
     beam: tuple[int, ...] = (2, 1)
@@ -37,6 +38,7 @@ class Effort(NamedTuple):
     last: int = 8
     enough: float = NOISE + ABOVE_NOISE
     pairs: int = 6
+    exchange: int = 4
 
 
 class Proposal(NamedTuple):
@@ -228,10 +230,10 @@ def _overlap(a: Term, b: Term) -> bool:
     return includes(a, b) or includes(b, a)
 
 
-def sharpen(setup: Setup[Any], ranked: list[Proposal], effort: Effort) -> list[Proposal]:
+def sharpen(setup: Setup[Any], parent: Entry, ranked: list[Proposal], effort: Effort) -> list[Proposal]:
     """Order proposals anew after a few iterations on some windows: one step says little of some effects."""
     pick, out = spread(setup.fitted, effort.sharpen), []
-    scale = typical(setup.baseline.r)
+    scale = typical(parent.fit.r)
     for p in ranked:
         f = fit(setup.problem, p.terms, p.start, pick, effort.quick)
         out.append(Proposal(f.terms, f.values, float(robust(f.r, scale))))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -13,13 +13,16 @@ from mpc_sgft.diagnose.fit import fit, robust, typical
 from mpc_sgft.diagnose.library import Term, includes, simplify
 from mpc_sgft.diagnose.prepare import Setup
 from mpc_sgft.diagnose.record import Array
-from mpc_sgft.diagnose.screen import Effort, couple, key_of, proposals, screen, sharpen, spread
+from mpc_sgft.diagnose.screen import Effort, Proposal, couple, key_of, proposals, screen, sharpen, spread
 from mpc_sgft.diagnose.table import ALIKE, EQUIVALENT
 
 FIRST, NEXT = (1.0, 0.1, 0.01), (0.3,)  # how far from no effect the fits of a first effect start, and of further ones
 REJUDGED = 6  # sets that are judged anew
 HOPELESS = 3.0  # times the error of a set, after a few iterations on some windows: no full fit
+MUCH = 0.05  # share of the squared error above noise, left of a set: its effects are exchanged for any others
 SWAPPED = 2  # of the best sets, in which effects are exchanged for those that start well where they end
+
+T = TypeVar("T")
 
 
 def search(
@@ -41,28 +44,20 @@ def search(
         effort: How widely.
     """
     found = {frozenset(): entry(setup, setup.baseline)}
-    beam, best, full, pairs = list(found.values()), found[frozenset()], 0, []
+    beam, best, pairs = list(found.values()), found[frozenset()], []
     for level in range(max_effects + 1):  # one more, in which simple effects may still be replaced by richer ones
         new: dict[frozenset[str], Entry] = {}
+        full = effort.full[min(level, len(effort.full) - 1)]
         for b, parent in enumerate(beam):
             report(f"{' + '.join(parent.names) or 'nominal'}", (level + b / len(beam)) / (max_effects + 1))
-            full = effort.full[min(level, len(effort.full) - 1)]
             options = proposals(parent, terms, max_effects, FIRST if not level else NEXT)
             ranked, samples = screen(setup, parent, options, effort.screen)
             if not level:
                 pairs = couple(parent, samples, setup, effort) if max_effects > 1 and effort.pairs else []
-            for proposal in sharpen(setup, ranked[: 2 * full], effort)[:full]:
-                key = key_of(setup, proposal.terms)
-                richer = len(proposal.terms) == len(parent.fit.terms)  # from a simpler set's optimum: once more
-                if key in new or key in found and not richer:
-                    continue
-                fitted = entry(setup, fit(setup.problem, proposal.terms, proposal.start, setup.fitted, effort.last))
-                if key not in found or fitted.error < found[key].error:
-                    new[key] = fitted
+            new |= promising(setup, parent, ranked, full, found | new, effort)
         if level == 1:
-            for proposal in sharpen(setup, [p for p in pairs if key_of(setup, p.terms) not in new], effort)[:full]:
-                f = fit(setup.problem, proposal.terms, proposal.start, setup.fitted, effort.last)
-                new[key_of(setup, proposal.terms)] = entry(setup, f)
+            left = [p for p in pairs if key_of(setup, p.terms) not in new]
+            new |= promising(setup, found[frozenset()], left, full, {}, effort)
         new = {key: no_worse(setup, e, found, effort) for key, e in new.items()}
         found |= new
         if not new:
@@ -74,7 +69,62 @@ def search(
             break
         if best.error < setup.quiet:
             break
+    best = min(found.values(), key=lambda e: e.error)
+    if effort.exchange and best.effects > 1 and judge.leaves(best.error, found[frozenset()].error, MUCH):
+        found |= exchange(setup, best, found, terms, effort)
     return list((found | swaps(setup, found, terms, effort)).values())
+
+
+def promising(
+    setup: Setup[Any],
+    parent: Entry,
+    ranked: list[Proposal],
+    full: int,
+    found: Mapping[frozenset[str], Entry],
+    effort: Effort,
+) -> dict[frozenset[str], Entry]:
+    """Full fits of the best proposals, those that are new or better than before.
+
+    Args:
+        setup: Problem and baseline.
+        parent: The set that they extend.
+        ranked: Proposals, best first.
+        full: How many get a full fit; twice as many get a quick one.
+        found: What was fitted already; from a simpler set's optimum, a richer set is fitted once more.
+        effort: How widely.
+    """
+    new: dict[frozenset[str], Entry] = {}
+    for proposal in sharpen(setup, parent, ranked[: 2 * full], effort)[:full]:
+        key = key_of(setup, proposal.terms)
+        richer = len(proposal.terms) == len(parent.fit.terms)
+        if key in new or key in found and not richer:
+            continue
+        fitted = entry(setup, fit(setup.problem, proposal.terms, proposal.start, setup.fitted, effort.last))
+        if key not in found or fitted.error < found[key].error:
+            new[key] = fitted
+    return new
+
+
+def exchange(
+    setup: Setup[Any], best: Entry, found: dict[frozenset[str], Entry], terms: Sequence[Term], effort: Effort
+) -> dict[frozenset[str], Entry]:
+    """What becomes of a set that leaves much when one effect makes way for any other, or starts elsewhere.
+
+    The search came to it one effect at a time: the first of two may be one that stands in for both.
+    """
+    new: dict[frozenset[str], Entry] = {}
+    nominal = len(setup.baseline.terms)
+    for i in range(nominal, nominal + best.effects):
+        less, start = _without(best.fit.terms, i), _without(best.fit.values, i)
+        parent = found.get(key_of(setup, less)) or entry(setup, fit(setup.problem, less, start, setup.fitted))
+        others = {key: e for key, e in (found | new).items() if key != best.key}
+        ranked, _ = screen(setup, parent, proposals(parent, terms, best.effects, NEXT), effort.screen)
+        new |= promising(setup, parent, ranked, effort.exchange, others, effort)
+    return {key: e for key, e in new.items() if key not in found or e.error < found[key].error}
+
+
+def _without(xs: Sequence[T], i: int) -> list[T]:
+    return [*xs[:i], *xs[i + 1 :]]
 
 
 def no_worse(setup: Setup[Any], e: Entry, found: Mapping[frozenset[str], Entry], effort: Effort) -> Entry:

@@ -66,6 +66,20 @@ def test_two_effects_that_nearly_cancel_are_found_together() -> None:
     assert found(pairs=4) == [{"x", "y"}]
 
 
+@pytest.mark.parametrize("exchange", [0, 2])
+def test_an_effect_that_stood_in_for_two_makes_way_for_them(exchange: int) -> None:
+    problem, fitted, none = Lines(), np.arange(18), np.zeros(1)
+    c = problem.columns
+    c["a"] = c["b"] + c["c"] + 0.6 * c["d"]
+    problem.y = 30 * (c["b"] + c["c"]) + np.random.default_rng(3).normal(size=problem.y.shape)
+    base = fit(problem, [], [], fitted)
+    setup = Setup(problem, fitted, np.arange(18, 24), fitted // 3, base, none, none, np.log1p, NOISE)
+    terms = [term(name) for name in "abcefgh"]
+    effort = Effort(beam=(1,), full=(1, 1, 1), pairs=0, exchange=exchange)
+    entries = search(setup, terms, 2, np.random.default_rng(0), effort=effort)
+    assert [set(e.names) for e in entries if e.error < NOISE + 0.1] == [{"b", "c"}] * bool(exchange)
+
+
 def test_a_delay_is_exchanged_for_a_lag_but_not_where_there_is_one() -> None:
     problem, fitted, none = Lines(), np.arange(18), np.zeros(1)
     terms = [term("actuator_delay"), term("actuator_lag")]
@@ -97,7 +111,7 @@ def test_a_simpler_effect_and_the_usual_name_of_a_term_are_tried_in_place_of_wha
     assert holds(start, next(iter(found))) and not holds(next(iter(found)), start) and not holds(start, start)
 
 
-def test_where_noise_alone_is_left_an_effect_must_gain_more() -> None:
+def test_where_noise_alone_is_left_one_more_effect_must_gain_more_than_the_only_one() -> None:
     problem, fitted, none = Lines(), np.arange(18), np.zeros(1)
     setup = Setup(
         problem,
@@ -112,16 +126,17 @@ def test_where_noise_alone_is_left_an_effect_must_gain_more() -> None:
     base, rng = entry(setup, setup.baseline), np.random.default_rng(0)
     scatter = np.abs(0.01 * rng.normal(size=24))
 
-    def better(before: float, gain: float) -> bool:
+    def better(before: float, gain: float, effects: int = 0) -> bool:
         small, large = (base._replace(errors=x + scatter) for x in (before, before - gain - scatter))
-        return gains(setup, small, large, rng)
+        return gains(setup, small._replace(effects=effects), large, rng)
 
-    assert not better(0.65, 0.045) and better(0.65, 0.1)
-    assert better(0.95, 0.045)
+    assert not better(0.65, 0.005) and better(0.65, 0.03)
+    assert not better(0.65, 0.03, effects=1) and better(0.65, 0.1, effects=1)
+    assert not better(0.95, 0.03) and better(0.95, 0.045)
 
 
 @pytest.mark.parametrize(
-    ("before", "after", "kind"), [(60.0, 12.0, "unknown"), (60.0, 6.0, "effect"), (6.0, 1.9, "effect")]
+    ("before", "after", "kind"), [(60.0, 8.0, "unknown"), (60.0, 6.0, "effect"), (6.0, 1.9, "effect")]
 )
 def test_names_that_leave_much_of_an_error_are_no_answer(before: float, after: float, kind: str) -> None:
     problem, fitted, none = Lines(), np.arange(18), np.zeros(1)
