@@ -110,6 +110,11 @@ def labels(out: Path) -> dict[str, dict[str, Any]]:
     return json.loads(text)["cases"]
 
 
+def label_hashes(out: Path) -> dict[str, str]:
+    """SHA-256 of each case's own label, by case name: of a label that is alike on two processors, alike."""
+    return {name: hashlib.sha256(json.dumps(x).encode()).hexdigest()[:16] for name, x in labels(out).items()}
+
+
 def seed_of(out: Path) -> int:
     """The seed that a folder was generated from."""
     return int(json.loads((out / "labels.json").read_text())["seed"])

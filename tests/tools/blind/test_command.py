@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from tools import blind_benchmark
+from tools.blind import cases, pack
 from tools.blind import draw as drawing
 
 
@@ -62,6 +63,24 @@ def test_generate_run_score_and_resume(
     assert "2 reports taken over" in capsys.readouterr().out
     assert blind_benchmark.main(["--seed", "5", "--cases", "2", "--out", str(tmp_path / "c"), *how]) == 2
     assert "holds reports on cases of seed 4" in capsys.readouterr().err and len(solver) == 2
+
+
+def test_packed_reports_count_for_cases_of_the_same_label(tmp_path: Path) -> None:
+    def labelled(name: str, second: float) -> Path:
+        """A folder with the labels of two cases."""
+        out = tmp_path / name
+        out.mkdir()
+        cases.seal(out, {"seed": 4, "cases": {"case_0000": {"size": 1.0}, "case_0001": {"size": second}}})
+        return out
+
+    here, there = labelled("here", 2.0), labelled("there", 2.0001)
+    for name in ("case_0000", "case_0001"):
+        (here / "reports" / name).mkdir(parents=True)
+        (here / "reports" / name / "blind.json").write_text('{"verdict": "none"}')
+    assert pack.pack(here, tmp_path / "kept") == 2
+    assert pack.unpack(tmp_path / "kept", there) == (1, 1)
+    assert [p.parent.name for p in there.rglob("blind.json")] == ["case_0000"]
+    assert pack.unpack(tmp_path / "kept", labelled("elsewhere", 2.00001)) == (2, 0)  # alike to five digits
 
 
 def test_errors_are_one_line_and_exit_2(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
