@@ -18,7 +18,7 @@ INSIDE = 1.1  # times the range, of readings in the right unit
 FACTORS = {"hinge": {"degrees": 180 / np.pi}, "slide": {"centimetres": 100.0, "millimetres": 1000.0}}
 SPAN = 10  # samples over which a speed is compared with the way that was made
 MOVES = 50.0  # times a position's scatter: less motion says nothing of its speed
-ALIKE, UNLIKE = 0.95, 0.3  # correlations
+ALIKE, UNLIKE = 0.95, 0.3  # correlations, of speeds about zero
 TWICE = 2.0  # a speed that is off by more is in another unit
 LEAD = 3  # samples by which a joint may not be ahead of its command
 REACH = 25  # samples
@@ -54,11 +54,12 @@ def check_speeds(table: Table, joints: Mapping[str, Axis]) -> None:
         way = q[SPAN:] - q[:-SPAN]
         total = np.concatenate([[0.0], np.cumsum((speed[1:] + speed[:-1]) / 2 * np.diff(time))])
         said = total[SPAN:] - total[:-SPAN]
-        like, times = _correlation(said, way), float(np.std(said) / max(np.std(way), 1e-300))
+        size = float(np.linalg.norm(said)), max(float(np.linalg.norm(way)), 1e-300)
+        like, times = float(said @ way) / max(size[0] * size[1], 1e-300), size[0] / size[1]  # an even speed counts
         if abs(like) < UNLIKE:
             raise UserError(
-                f"{table.name}: qvel/{joint} is not the derivative of qpos/{joint} (correlation {like:.2f}). Is it of "
-                "another joint? Mend it, or leave it out: speeds are worked out from positions where there are none."
+                f"{table.name}: qvel/{joint} is not the derivative of qpos/{joint} (likeness {like:.2f} of 1). Is it "
+                "of another joint? Mend it, or leave it out: speeds are worked out from positions where there are none."
             )
         if like < -ALIKE:
             raise UserError(f"{table.name}: qvel/{joint} has the sign opposite to the derivative of qpos/{joint}.")

@@ -55,6 +55,13 @@ def test_a_speed_is_the_derivative_of_its_position(speed: np.ndarray, words: str
         check_speeds(table(qpos__elbow=np.sin(T), qvel__elbow=speed), ARM)
 
 
+def test_an_even_speed_is_sound_and_its_unit_shows() -> None:
+    even = 0.05 + 0.005 * np.random.default_rng(0).normal(size=1000)
+    check_speeds(table(qpos__elbow=0.05 * T, qvel__elbow=even), ARM)
+    with pytest.raises(UserError, match="57[.0-9]* times the derivative"):
+        check_speeds(table(qpos__elbow=0.05 * T, qvel__elbow=np.degrees(even)), ARM)
+
+
 def test_noisy_delayed_and_misread_speeds_are_sound() -> None:
     rng = np.random.default_rng(0)
     for speed in (np.cos(T) + 0.3 * rng.normal(size=1000), np.cos(T - 0.1), 1.3 * np.cos(T)):
