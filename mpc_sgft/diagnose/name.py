@@ -20,6 +20,7 @@ from mpc_sgft.diagnose.table import EQUIVALENT, Equivalence
 UNEXPLAINED = 0.05  # share of what any model can explain that named effects may miss before the answer is "unknown"
 FIRST_GAIN = 0.025  # in log(1 + e), of the only effect where the nominal model leaves noise alone
 NEXT_GAIN = 0.06  # in log(1 + e), of one more effect where noise alone is left
+RICHER_SHARE = 0.2  # of what is worth a name, of a richer effect in place of one that it includes
 WIDER = 1.3  # of intervals: what windows that begin at each other's ends share; set on development seeds
 LEFT = 0.1  # share of the squared error above noise that names may leave
 
@@ -57,9 +58,14 @@ def choose(setup: Setup[Any], entries: list[Entry], rng: np.random.Generator) ->
 
 
 def gains(setup: Setup[Any], small: Entry, large: Entry, rng: np.random.Generator) -> bool:
-    """Whether a larger set is credibly better; where noise alone is left, one more effect must gain more."""
+    """Whether a larger set is credibly better; where noise alone is left, one more effect must gain more.
+
+    A richer effect in place of a simpler one is no further cause, and gains nothing where the simpler one is the truth.
+    """
     least = judge.worth(small.error)
-    if small.effects and settled(small):
+    if holds(large, small):
+        least *= RICHER_SHARE
+    elif small.effects and settled(small):
         least = NEXT_GAIN
     elif not small.effects and small.error < setup.quiet:
         least = FIRST_GAIN
@@ -111,7 +117,8 @@ def judge_entries(
         np.array([e.errors for e in rivals]), np.array([e.complexity for e in rivals]), rng, setup.problem.blocks
     )
     probability |= {e.key: float(s) for e, s in zip(rivals, shares, strict=True)}
-    declared = [(e, equivalence(best, e)) for e in find_ties(setup, best, entries, rng)]
+    best, ties = as_given(setup, best, find_ties(setup, best, entries, rng))
+    declared = [(e, equivalence(best, e)) for e in ties]
     base = entries[0]
     if flexible is not None and beats(flexible, best, base, setup.parts, rng):
         missed = (best.error - flexible.error) / max(base.error - flexible.error, 1e-12)
@@ -156,6 +163,37 @@ def find_ties(setup: Setup[Any], best: Entry, entries: list[Entry], rng: np.rand
     other = [e for e in rivals if sorted(e.names) != sorted(best.names) and not holds(e, best)]
     tied = [e for e in other if not judge.worse(e.errors, best.errors, rng, odds(setup, best, e))]
     return sorted(tied, key=lambda e: e.error)
+
+
+def as_given(setup: Setup[Any], best: Entry, ties: list[Entry]) -> tuple[Entry, list[Entry]]:
+    """The best set, and the ties that are left, where some need nominal quantities that are just as given.
+
+    An uncertain mass could be any within its range: where a set finds it to a fraction of that range, and there at the
+    nominal value, a set that does as well with another mass needs a second cause, and the first a coincidence.
+    """
+    count = len(setup.baseline.terms)
+    if not count or not ties:
+        return best, ties
+    sets = [best, *ties]
+    plain = np.array([_odds_as_given(e, count) for e in sets])
+    least = plain.max() - np.log(judge.TIE_ODDS)
+    kept = [e for e, x in zip(sets, plain, strict=True) if x >= least]
+    return kept[0], kept[1:]
+
+
+def _odds_as_given(e: Entry, count: int) -> float:
+    """Logarithm of how much likelier nominal quantities are as given than anywhere in their range (Savage-Dickey).
+
+    Args:
+        e: A set.
+        count: Nominal terms, its first ones.
+    """
+    total = 0.0
+    for term, value, sd in zip(e.fit.terms[:count], e.fit.values[:count], deviations(e)[:count], strict=True):
+        span = term.high - term.low
+        there = stats.norm.pdf(term.neutral, value, np.maximum(sd, 1e-12 * span))
+        total += float(np.log((1 + span * there) / 2).sum())
+    return total
 
 
 def holds(rich: Entry, simple: Entry) -> bool:
@@ -213,8 +251,8 @@ def beats(flexible: Flexible, best: Entry, base: Entry, parts: int, rng: np.rand
     return best.error - flexible.error > UNEXPLAINED * (base.error - flexible.error)
 
 
-def intervals(f_entry: Entry, level: float = 0.90) -> list[tuple[Array, Array]]:
-    """Low and high of each effect's parameters: the wider of the model's and the windows' own scatter.
+def deviations(f_entry: Entry) -> list[Array]:
+    """Standard deviations of each term's parameters: the wider of the model's and the windows' own scatter.
 
     The first takes residuals as white, the second (a sandwich over windows) lets each window have its own error.
     """
@@ -228,13 +266,18 @@ def intervals(f_entry: Entry, level: float = 0.90) -> list[tuple[Array, Array]]:
     white = np.diag(inverse) * max(1.0, float(weight @ (f.r**2).mean(1) / weight.sum()))
     scores = np.einsum("w,wmp,wm->wp", weight, f.J, f.r, optimize=True)
     windows = np.diag(inverse @ (scores.T @ scores) @ inverse)
-    sd = WIDER * np.sqrt(np.maximum(white, windows)) * float(stats.t.ppf(0.5 + level / 2, max(len(f.r) - 1, 1)))
-    out, at = [], 0
-    for term, value in zip(f.terms, f.values, strict=True):
-        half = sd[at : at + len(value)] * term.size
-        out.append((np.maximum(value - half, term.low), np.minimum(value + half, term.high)))
-        at += len(value)
-    return out[len(f.terms) - f_entry.effects :]
+    sd = WIDER * np.sqrt(np.maximum(white, windows))
+    ends = np.cumsum([len(t.size) for t in f.terms])
+    return [x * t.size for x, t in zip(np.split(sd, ends[:-1]), f.terms, strict=True)]
+
+
+def intervals(f_entry: Entry, level: float = 0.90) -> list[tuple[Array, Array]]:
+    """Low and high of each effect's parameters."""
+    f = f_entry.fit
+    half = float(stats.t.ppf(0.5 + level / 2, max(len(f.r) - 1, 1)))
+    rows = zip(f.terms, f.values, deviations(f_entry), strict=True) if f.terms else ()
+    bounds = [(np.maximum(v - half * sd, t.low), np.minimum(v + half * sd, t.high)) for t, v, sd in rows]
+    return bounds[len(f.terms) - f_entry.effects :]
 
 
 def _list(e: Entry) -> str:

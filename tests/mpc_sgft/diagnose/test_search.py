@@ -135,6 +135,38 @@ def test_where_noise_alone_is_left_one_more_effect_must_gain_more_than_the_only_
     assert not better(0.95, 0.03) and better(0.95, 0.045)
 
 
+def test_a_richer_effect_in_place_of_what_it_includes_need_gain_less_than_a_further_one() -> None:
+    problem, fitted, none = Lines(), np.arange(18), np.zeros(1)
+    setup = Setup(problem, fitted, np.arange(18, 24), fitted // 3, fit(problem, [], [], fitted), none, none)
+    base, rng = entry(setup, setup.baseline)._replace(effects=1), np.random.default_rng(0)
+    scatter = np.abs(0.01 * rng.normal(size=24))
+
+    def better(name: str, gain: float) -> bool:
+        small, large = (base._replace(fit=base.fit._replace(terms=(term(t),))) for t in ("coulomb_friction", name))
+        errors = 0.65 + scatter, 0.65 - gain - scatter
+        return gains(setup, small._replace(errors=errors[0]), large._replace(errors=errors[1]), rng)
+
+    assert better("stribeck_friction", 0.02) and not better("stribeck_friction", -0.01)
+    assert not better("deadband", 0.02) and better("deadband", 0.1)
+
+
+@pytest.mark.parametrize(("mass", "kind"), [(1.0, "effect"), (0.9, "not_identifiable")])
+def test_a_tie_that_needs_another_mass_loses_against_one_that_finds_it_as_given(mass: float, kind: str) -> None:
+    problem, fitted, none, one = Lines(), np.arange(18), np.zeros(1), np.ones(1)
+    c = problem.columns
+    c["nominal"] = 100 * c["h"]
+    c["b"] = c["a"] + 0.05 * c["nominal"]
+    problem.y = mass * c["nominal"] + 3 * c["a"] + np.random.default_rng(3).normal(size=problem.y.shape)
+    nominal = replace(term("nominal"), neutral=one, low=0.7 * one, high=1.3 * one, size=0.15 * one)
+    base = fit(problem, [nominal], [one], fitted)
+    setup = Setup(problem, fitted, np.arange(18, 24), fitted // 3, base, none, none, np.log1p)
+    named = [entry(setup, fit(problem, [nominal, term(x)], [one, one], fitted)) for x in "ba"]
+    verdict = judge_entries(setup, [entry(setup, base), *named], None, np.random.default_rng(0))
+    assert verdict.kind == kind and sorted({*verdict.best.names, *(n for e, _ in verdict.ties for n in e.names)}) == (
+        ["a"] if kind == "effect" else ["a", "b"]
+    )
+
+
 @pytest.mark.parametrize(
     ("before", "after", "kind"), [(60.0, 8.0, "unknown"), (60.0, 6.0, "effect"), (6.0, 1.9, "effect")]
 )
