@@ -20,6 +20,7 @@ FIRST, NEXT = (1.0, 0.1, 0.01), (0.3,)  # how far from no effect the fits of a f
 REJUDGED = 6  # sets that are judged anew
 HOPELESS = 3.0  # times the error of a set, after a few iterations on some windows: no full fit
 MUCH = 0.05  # share of the squared error above noise, left of a set: its effects are exchanged for any others
+WIDE = 2  # times as many sets that extend one that leaves noise alone: what more there is, is small
 SWAPPED = 2  # of the best sets, in which effects are exchanged for those that start well where they end
 
 T = TypeVar("T")
@@ -44,10 +45,10 @@ def search(
         effort: How widely.
     """
     found = {frozenset(): entry(setup, setup.baseline)}
-    beam, best, pairs = list(found.values()), found[frozenset()], []
+    beam, best, pairs, wide = list(found.values()), found[frozenset()], [], 1
     for level in range(max_effects + 1):  # one more, in which simple effects may still be replaced by richer ones
         new: dict[frozenset[str], Entry] = {}
-        full = effort.full[min(level, len(effort.full) - 1)]
+        full = effort.full[min(level, len(effort.full) - 1)] * wide
         for b, parent in enumerate(beam):
             report(f"{' + '.join(parent.names) or 'nominal'}", (level + b / len(beam)) / (max_effects + 1))
             options = proposals(parent, terms, max_effects, FIRST if not level else NEXT)
@@ -68,7 +69,7 @@ def search(
         elif level or best.error <= effort.enough:
             break
         if best.error < setup.quiet:
-            break
+            beam, wide = beam[:1], WIDE
     best = min(found.values(), key=lambda e: e.error)
     if effort.exchange and best.effects > 1 and judge.leaves(best.error, found[frozenset()].error, MUCH):
         found |= exchange(setup, best, found, terms, effort)
@@ -93,15 +94,19 @@ def promising(
         found: What was fitted already; from a simpler set's optimum, a richer set is fitted once more.
         effort: How widely.
     """
+    richer = [p for p in ranked if len(p.terms) == len(parent.fit.terms)]
+    others = [p for p in ranked if len(p.terms) > len(parent.fit.terms)][: 2 * full]
     new: dict[frozenset[str], Entry] = {}
-    for proposal in sharpen(setup, parent, ranked[: 2 * full], effort)[:full]:
-        key = key_of(setup, proposal.terms)
-        richer = len(proposal.terms) == len(parent.fit.terms)
-        if key in new or key in found and not richer:
-            continue
-        fitted = entry(setup, fit(setup.problem, proposal.terms, proposal.start, setup.fitted, effort.last))
-        if key not in found or fitted.error < found[key].error:
-            new[key] = fitted
+    for some, count in ((richer, len(richer)), (others, full)):
+        best: dict[frozenset[str], Proposal] = {}
+        for p in sharpen(setup, parent, some, effort):
+            best.setdefault(key_of(setup, p.terms), p)
+        for key, proposal in list(best.items())[:count]:
+            if key in found and some is others:
+                continue
+            fitted = entry(setup, fit(setup.problem, proposal.terms, proposal.start, setup.fitted, effort.last))
+            if key not in found or fitted.error < found[key].error:
+                new[key] = fitted
     return new
 
 

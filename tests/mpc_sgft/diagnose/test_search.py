@@ -66,6 +66,18 @@ def test_two_effects_that_nearly_cancel_are_found_together() -> None:
     assert found(pairs=4) == [{"x", "y"}]
 
 
+def test_a_small_second_effect_is_found_where_the_first_leaves_less_than_the_noise_that_was_foretold() -> None:
+    problem, fitted, none = Lines(), np.arange(18), np.zeros(1)
+    c = problem.columns
+    problem.y = 3 * c["a"] + 0.4 * c["b"] + 0.8 * np.random.default_rng(3).normal(size=problem.y.shape)
+    base, rng = fit(problem, [], [], fitted), np.random.default_rng(0)
+    setup = Setup(problem, fitted, np.arange(18, 24), fitted // 3, base, none, none, np.log1p, NOISE)
+    entries = search(setup, [term(name) for name in "abcdefgh"], 2, rng)
+    assert next(e.error for e in entries if e.names == ["a"]) < setup.quiet
+    verdict = judge_entries(setup, entries, None, rng)
+    assert (verdict.kind, sorted(verdict.best.names)) == ("effect", ["a", "b"])
+
+
 @pytest.mark.parametrize("exchange", [0, 2])
 def test_an_effect_that_stood_in_for_two_makes_way_for_them(exchange: int) -> None:
     problem, fitted, none = Lines(), np.arange(18), np.zeros(1)
