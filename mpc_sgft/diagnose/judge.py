@@ -13,7 +13,8 @@ RESAMPLES = 1000
 GAIN_LEVEL = 0.98  # a larger structure must be better with this confidence ...
 TIE_LEVEL = 0.90  # ... while a rival of the same size must be worse with this one, or it ties
 TIE_GAIN = 0.01  # ... by more than this in log(1 + e)
-TIE_ODDS = 20.0  # ... or be so much less likely, where what is left is noise
+TIE_ODDS = 20.0  # ... or, where what is left is noise, be so much less likely
+SURE_ODDS = 1000.0  # so much likelier, where what is left is noise, needs no confidence: a few windows give none
 FEW = 12  # windows
 MIN_GAIN = 0.05  # in log(1 + e): a gain below is not worth a name ...
 MIN_SHARE = 0.05  # ... nor one below this share of the error
@@ -71,6 +72,7 @@ def credible(
     parts: int = 1,
     least: float | None = None,
     one_window: bool = False,
+    odds: float | None = None,
 ) -> bool:
     """Whether the gain is real, in more than one window, and large enough to matter.
 
@@ -80,24 +82,26 @@ def credible(
         parts: Of each window.
         least: Gain that matters, in log(1 + e); what is worth a name if None.
         one_window: Whether several parts of one window will do.
+        odds: Logarithm of how much likelier the data are with the better one; None where that is not known.
     """
     g = gain(worse, better, 2 * GAIN_LEVEL - 1, rng)
     drops = (worse - better).reshape(-1, 1 if one_window else parts).mean(1)
     elsewhere = (drops.sum() - drops.max()) / max(len(drops) - 1, 1)
     least = worth(float(worse.mean())) if least is None else least
-    return g.low > 0 and g.mean > least and bool(elsewhere > min(ELSEWHERE, ELSEWHERE_SHARE * least))
+    real = g.low > 0 or odds is not None and odds > np.log(SURE_ODDS)
+    return real and g.mean > least and bool(elsewhere > min(ELSEWHERE, ELSEWHERE_SHARE * least))
 
 
-def worse(rival: Array, best: Array, rng: np.random.Generator, odds: float = 0.0) -> bool:
+def worse(rival: Array, best: Array, rng: np.random.Generator, odds: float | None = None) -> bool:
     """Whether a rival of the same size can be ruled out.
 
     Args:
         rival, best: Errors of the same parts of windows, [W].
         rng: For the bootstrap.
-        odds: Logarithm of how much likelier the data are with the best, 0 if that is not known.
+        odds: Logarithm of how much likelier the data are with the best; None where that is not known.
     """
     g = gain(rival, best, 2 * TIE_LEVEL - 1, rng)
-    return g.mean > TIE_GAIN and bool(g.low > 0 or odds > np.log(TIE_ODDS))
+    return g.mean > TIE_GAIN and bool(g.low > 0 if odds is None else odds > np.log(TIE_ODDS))
 
 
 def win_shares(errors: Array, complexity: Array, rng: np.random.Generator, points: int) -> Array:

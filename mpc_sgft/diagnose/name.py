@@ -44,11 +44,11 @@ class Verdict(NamedTuple):
 
 
 def choose(setup: Setup[Any], entries: list[Entry], rng: np.random.Generator) -> Entry:
-    """The smallest set that no larger one credibly beats; of several effects, each must be away from none."""
+    """The smallest set that no larger one credibly beats; of several effects, each must be surely there."""
     current = entries[0]
     while True:
         larger = [e for e in entries if e.complexity > current.complexity and e.error < current.error]
-        better = [e for e in larger if gains(setup, current, e, rng) and (e.effects < 2 or distinct(e))]
+        better = [e for e in larger if gains(setup, current, e, rng) and (e.effects < 2 or sure(setup, current, e))]
         if not better:
             return prune(setup, current, entries, rng)
         smallest = min(e.complexity for e in better)
@@ -69,7 +69,14 @@ def gains(setup: Setup[Any], small: Entry, large: Entry, rng: np.random.Generato
         least = NEXT_GAIN
     elif not small.effects and small.error < setup.quiet:
         least = FIRST_GAIN
-    return judge.credible(small.errors, large.errors, rng, setup.parts, least, setup.one_window(large.errors))
+    likelier = odds(setup, large, small)
+    return judge.credible(small.errors, large.errors, rng, setup.parts, least, setup.one_window(large.errors), likelier)
+
+
+def sure(setup: Setup[Any], small: Entry, large: Entry) -> bool:
+    """Whether each effect is away from none, or, where noise alone is left, the data are far likelier with all."""
+    likelier = odds(setup, large, small) if small.effects else None
+    return distinct(large) or likelier is not None and likelier > np.log(judge.SURE_ODDS)
 
 
 def distinct(e: Entry) -> bool:
@@ -207,13 +214,16 @@ def no_larger(e: Entry, best: Entry) -> bool:
     return e.complexity <= best.complexity or sum(map(len, e.values)) <= sum(map(len, best.values))
 
 
-def odds(setup: Setup[Any], best: Entry, rival: Entry) -> float:
-    """Logarithm of how much likelier the data are with the best than with a rival; 0 where it leaves more than noise.
+def odds(setup: Setup[Any], best: Entry, rival: Entry) -> float | None:
+    """Logarithm of how much likelier the data are with the best than with a rival; None where more than noise is left.
 
-    Of one signal's independent residuals: noise is not quite white.
+    Of one signal's independent residuals: noise is not quite white. Those of windows that are left out, where the best
+    has more parameters.
     """
-    points = setup.problem.blocks / setup.parts if settled(best) else 0.0
-    return points * float((np.expm1(rival.fitted) - np.expm1(best.fitted)).sum()) / 2
+    if not settled(best):
+        return None
+    a, b = (e.errors if best.complexity > rival.complexity else e.fitted for e in (rival, best))
+    return setup.problem.blocks / setup.parts * float((np.expm1(a) - np.expm1(b)).sum()) / 2
 
 
 def equivalence(a: Entry, b: Entry) -> Equivalence | None:

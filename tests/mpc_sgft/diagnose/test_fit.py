@@ -144,6 +144,15 @@ def test_where_noise_alone_is_left_a_rival_is_ruled_out_by_its_odds() -> None:
     even, one = np.zeros(24), np.where(np.arange(24) == 0, 0.6, 0.0)
     assert not judge.worse(one, even, rng) and not judge.worse(one, even, rng, odds=np.log(19))
     assert judge.worse(one, even, rng, odds=np.log(21))
+    assert judge.worse(even + 0.02, even, rng) and not judge.worse(even + 0.02, even, rng, odds=np.log(19))
+
+
+def test_where_noise_alone_is_left_great_odds_need_no_confidence() -> None:
+    rng, after = np.random.default_rng(0), np.full(24, 0.5)
+    before = after + np.where(np.arange(24) % 2, 0.6, -0.4)  # 0.1 on average, and less in every other part
+    assert not judge.credible(before, after, rng) and not judge.credible(before, after, rng, odds=np.log(999))
+    assert judge.credible(before, after, rng, odds=np.log(1001))
+    assert not judge.credible(after + 0.01, after, rng, odds=np.log(1001))
 
 
 class Rugged(Line):
