@@ -23,6 +23,7 @@ from mpc_sgft.diagnose.table import INCLUDES, TABLE, Row, Scales
 from mpc_sgft.errors import UserError, unknown
 
 HIDDEN = ("velocity", "rest", "deflection", "damping_ratio")  # parameters that mean nothing while the effect is neutral
+RICHER = 0.5  # of the simpler effect's size: where a fit of what the richer one does beyond it begins
 LONG = (int(mujoco.mjtGeom.mjGEOM_CAPSULE), int(mujoco.mjtGeom.mjGEOM_CYLINDER))
 
 
@@ -212,25 +213,39 @@ def _level(effect: Effect, force: Array, joints: list[str]) -> Array:
 
 
 def includes(rich: Term, simple: Term) -> bool:
-    """Whether one effect can do all that another does at the same place."""
+    """Whether one effect can do all that another does at the same place, be it itself with more of it fixed."""
+    if rich.effect == simple.effect and rich.at == simple.at:
+        return len(rich.fixed) < len(simple.fixed) and all(simple.fixed.get(k) == v for k, v in rich.fixed.items())
     return simple.effect in INCLUDES.get(rich.effect, {}) and simple.at == rich.at
+
+
+def _shared(rich: Term, simple: Term) -> dict[str, str]:
+    """Parameters of the richer effect -> of the simpler one, which give the same physics."""
+    return {n: n for n in simple.names} if rich.effect == simple.effect else INCLUDES[rich.effect][simple.effect]
 
 
 def simplify(rich: Term, value: Array, simple: Term) -> Array:
     """Parameters with which the simpler effect comes nearest to what the richer one does."""
-    mapping = INCLUDES[rich.effect][simple.effect]
+    mapping = _shared(rich, simple)
     shares = [[value[i] for i, name in enumerate(rich.names) if mapping.get(name) == p] for p in simple.names]
     return np.clip([float(np.mean(x)) for x in shares], simple.low, simple.high)
 
 
 def enrich(rich: Term, simple: Term, value: Array) -> list[Array]:
-    """Parameters with which the richer effect does what the simpler one does, for each start of those that idle."""
-    mapping = INCLUDES[rich.effect][simple.effect]
-    out = []
+    """Parameters with which the richer effect does what the simpler one does, for each start of those that idle.
+
+    Then the same with what only the richer effect has at a share of the simpler one's size: where it does nothing, the
+    parameters that idle cannot be told from one another.
+    """
+    mapping = _shared(rich, simple)
+    own = [n not in mapping and n not in HIDDEN for n in rich.names]
+    same = []
     for start in rich.starts:
         x = np.array([s if n in HIDDEN else z for n, s, z in zip(rich.names, start, rich.neutral, strict=True)])
         for i, name in enumerate(rich.names):
             if name in mapping:
                 x[i] = value[simple.names.index(mapping[name])]
-        out.append(np.clip(x, rich.low, rich.high))
+        same.append(x)
+    more = [np.where(own, rich.neutral + RICHER * value[0], x) for x in same] if any(own) else []
+    out = [np.clip(x, rich.low, rich.high) for x in (*same, *more)]
     return [x for i, x in enumerate(out) if not any(np.array_equal(x, y) for y in out[:i])]

@@ -63,9 +63,9 @@ def proposals(parent: Entry, terms: Sequence[Term], max_effects: int, shares: tu
     base, values = parent.fit.terms, parent.fit.values
     mine = {t.label for t in parent.terms}
     for term in terms:
-        if term.label in mine or any(includes(old, term) for old in parent.terms):
-            continue
         simpler = [i for i, old in enumerate(base) if includes(term, old)]
+        if any(includes(old, term) for old in parent.terms) or (term.label in mine and not simpler):
+            continue
         if simpler:
             i = simpler[0]
             for start in enrich(term, base[i], values[i]):

@@ -54,11 +54,11 @@ TABLE: dict[str, Row] = {
     "asymmetric_friction": Row({"forward": Par(0.0, _viscous), "backward": Par(0.0, _viscous)}),
     "stribeck_friction": Row(
         {
-            "coulomb": Par(0.0, _force, (0.1, 0.1)),
-            "excess": Par(0.0, _force, (0.1, 0.1), 0.0),
+            "coulomb": Par(0.0, _force),
+            "excess": Par(0.0, _force, low=0.0),
             "velocity": Par(0.0, lambda s: s.speed, (0.1, 0.5), 0.01, 3.0),
-            "deflection": Par(0.0, lambda s: 1e-3 * s.travel, (1.0, 5.0), 0.1, 50.0),
-            "damping_ratio": Par(0.0, lambda s: 1.0, (0.3, 0.3), 0.02, 2.0),
+            "deflection": Par(0.0, lambda s: 1e-3 * s.travel, (1.0,), 0.1, 50.0),
+            "damping_ratio": Par(0.0, lambda s: 1.0, (0.1,), 0.02, 2.0),
         },
         sums={"static": ("coulomb", "excess")},
         variants=({"deflection": 0.0, "damping_ratio": 0.5}, {}),

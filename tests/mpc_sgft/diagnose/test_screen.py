@@ -9,7 +9,7 @@ import pytest
 from mpc_sgft.diagnose import screen as screening
 from mpc_sgft.diagnose.entry import entry
 from mpc_sgft.diagnose.fit import Fit, fit
-from mpc_sgft.diagnose.library import Term, candidates, enrich
+from mpc_sgft.diagnose.library import Term, candidates, enrich, includes, simplify
 from mpc_sgft.diagnose.plant import Change, Plant
 from mpc_sgft.diagnose.prepare import Setup
 from mpc_sgft.diagnose.screen import proposals, screen
@@ -58,12 +58,16 @@ def test_an_effect_far_below_its_typical_size_is_seen(
 
 def test_a_richer_effect_starts_where_the_simpler_one_ended_whatever_its_idle_parameters() -> None:
     plant = Plant(mujoco.MjSpec.from_string(HINGE))
-    dry, rich, _ = candidates(
+    dry, rich, bristles = candidates(
         plant, {("joint", "hinge"): Scales(force=2.0, speed=1.0)}, ["coulomb_friction", "stribeck_friction"]
     )
     starts = enrich(rich, dry, np.array([0.7]))
     assert rich.names == ("coulomb", "excess", "velocity")
-    np.testing.assert_allclose(starts, [[0.7, 0.0, 0.1], [0.7, 0.0, 0.5]])
+    np.testing.assert_allclose(starts, [[0.7, 0.0, 0.1], [0.7, 0.0, 0.5], [0.7, 0.35, 0.1], [0.7, 0.35, 0.5]])
+    assert includes(bristles, rich) and not includes(rich, bristles) and not includes(rich, rich)
+    assert bristles.names == ("coulomb", "excess", "velocity", "deflection", "damping_ratio")
+    np.testing.assert_allclose(enrich(bristles, rich, np.array([0.7, 0.2, 0.3])), [[0.7, 0.2, 0.3, 0.001, 0.1]])
+    np.testing.assert_allclose(simplify(bristles, np.array([0.7, 0.2, 0.3, 0.004, 0.5]), rich), [0.7, 0.2, 0.3])
 
 
 def test_every_effect_of_a_set_counts_however_much_another_shows() -> None:
