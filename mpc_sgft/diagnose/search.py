@@ -21,6 +21,7 @@ REJUDGED = 6  # sets that are judged anew
 HOPELESS = 3.0  # times the error of a set, after a few iterations on some windows: no full fit
 MUCH = 0.05  # share of the squared error above noise, left of a set: its effects are exchanged for any others
 WIDE = 2  # times as many sets that extend one that leaves noise alone: what more there is, is small
+STARTS = 2  # of each richer set that get a quick fit
 SWAPPED = 2  # of the best sets, in which effects are exchanged for those that start well where they end
 
 T = TypeVar("T")
@@ -90,14 +91,17 @@ def promising(
         setup: Problem and baseline.
         parent: The set that they extend.
         ranked: Proposals, best first.
-        full: How many get a full fit; twice as many get a quick one.
+        full: How many get a full fit, beside richer effects in place of simpler ones; twice as many get a quick one.
         found: What was fitted already; from a simpler set's optimum, a richer set is fitted once more.
         effort: How widely.
     """
-    richer = [p for p in ranked if len(p.terms) == len(parent.fit.terms)]
+    starts: dict[frozenset[str], list[Proposal]] = {}  # of sets in which an effect becomes a richer one
+    for p in (p for p in ranked if len(p.terms) == len(parent.fit.terms)):
+        starts.setdefault(key_of(setup, p.terms), []).append(p)
+    richer = [p for ps in starts.values() for p in ps[:STARTS]]
     others = [p for p in ranked if len(p.terms) > len(parent.fit.terms)][: 2 * full]
     new: dict[frozenset[str], Entry] = {}
-    for some, count in ((richer, len(richer)), (others, full)):
+    for some, count in ((richer, len(starts)), (others, full)):
         best: dict[frozenset[str], Proposal] = {}
         for p in sharpen(setup, parent, some, effort):
             best.setdefault(key_of(setup, p.terms), p)
