@@ -132,16 +132,27 @@ def reports(client: ViewerClient) -> list[str]:
 
 
 def _load(client: ViewerClient, rrd: Path) -> None:
-    try:
-        client.open(str(rrd.resolve()))
-    except RuntimeError as error:
-        raise ScreenshotError(f"The viewer cannot open {rrd}: {error}") from error
     deadline = time.monotonic() + LOAD_SECONDS
+    try:
+        while not _answers(client) and time.monotonic() < deadline:
+            time.sleep(0.1)
+        client.open(str(rrd.resolve()))
+    except (RuntimeError, TimeoutError) as error:
+        raise ScreenshotError(f"The viewer cannot open {rrd}: {error}") from error
     while client.get_state().loading:
         if time.monotonic() > deadline:
             raise ScreenshotError(f"{rrd} was still loading after {LOAD_SECONDS:.0f} s.")
         time.sleep(0.1)
     _recording(client)
+
+
+def _answers(client: ViewerClient) -> bool:
+    """Whether the viewer has come up; on a busy machine it takes a while after its port is open."""
+    try:
+        client.get_state()
+    except TimeoutError:
+        return False
+    return True
 
 
 def _recording(client: ViewerClient) -> Recording:
