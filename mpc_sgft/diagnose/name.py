@@ -69,13 +69,13 @@ def gains(setup: Setup[Any], small: Entry, large: Entry, rng: np.random.Generato
         least = NEXT_GAIN
     elif not small.effects and small.error < setup.quiet:
         least = FIRST_GAIN
-    likelier = odds(setup, large, small)
+    likelier = odds(setup, large, small) if settled(small) else None
     return judge.credible(small.errors, large.errors, rng, setup.parts, least, setup.one_window(large.errors), likelier)
 
 
 def sure(setup: Setup[Any], small: Entry, large: Entry) -> bool:
     """Whether each effect is away from none, or, where noise alone is left, the data are far likelier with all."""
-    likelier = odds(setup, large, small) if small.effects else None
+    likelier = odds(setup, large, small) if small.effects and settled(small) else None
     return distinct(large) or likelier is not None and likelier > np.log(judge.SURE_ODDS)
 
 

@@ -21,6 +21,7 @@ REJUDGED = 6  # sets that are judged anew
 HOPELESS = 3.0  # times the error of a set, after a few iterations on some windows: no full fit
 MUCH = 0.05  # share of the squared error above noise, left of a set: its effects are exchanged for any others
 WIDE = 2  # times as many sets that extend one that leaves noise alone: what more there is, is small
+PAIR = 2  # effects, of the largest set that is looked for where a smaller one leaves noise alone
 STARTS = 2  # of each richer set that get a quick fit
 SWAPPED = 2  # of the best sets, in which effects are exchanged for those that start well where they end
 
@@ -46,13 +47,14 @@ def search(
         effort: How widely.
     """
     found = {frozenset(): entry(setup, setup.baseline)}
-    beam, best, pairs, wide = list(found.values()), found[frozenset()], [], 1
+    beam, best, pairs = list(found.values()), found[frozenset()], []
+    most, wide = max_effects, 1
     for level in range(max_effects + 1):  # one more, in which simple effects may still be replaced by richer ones
         new: dict[frozenset[str], Entry] = {}
         full = effort.full[min(level, len(effort.full) - 1)] * wide
         for b, parent in enumerate(beam):
             report(f"{' + '.join(parent.names) or 'nominal'}", (level + b / len(beam)) / (max_effects + 1))
-            options = proposals(parent, terms, max_effects, FIRST if not level else NEXT)
+            options = proposals(parent, terms, most, FIRST if not level else NEXT)
             ranked, samples = screen(setup, parent, options, effort.screen)
             if not level:
                 pairs = couple(parent, samples, setup, effort) if max_effects > 1 and effort.pairs else []
@@ -70,7 +72,7 @@ def search(
         elif level or best.error <= effort.enough:
             break
         if best.error < setup.quiet:
-            beam, wide = beam[:1], WIDE
+            beam, most, wide = beam[:1], min(most, PAIR), WIDE
     best = min(found.values(), key=lambda e: e.error)
     if effort.exchange and best.effects > 1 and judge.leaves(best.error, found[frozenset()].error, MUCH):
         found |= exchange(setup, best, found, terms, effort)

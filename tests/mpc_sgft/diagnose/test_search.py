@@ -76,6 +76,7 @@ def test_a_small_second_effect_is_found_where_the_first_leaves_less_than_the_noi
     assert next(e.error for e in entries if e.names == ["a"]) < setup.quiet
     verdict = judge_entries(setup, entries, None, rng)
     assert (verdict.kind, sorted(verdict.best.names)) == ("effect", ["a", "b"])
+    assert max(e.effects for e in search(setup, [term(x) for x in "abcdefgh"], 3, rng)) == 2  # nor a third
 
 
 @pytest.mark.parametrize("exchange", [0, 2])
