@@ -72,7 +72,7 @@ def diagnose_run(
             bar.set_postfix_str(what)
             bar.update(round(95 * share) - bar.n)
 
-        entries = search(setup, terms, max_effects, rng, show, EFFORT)
+        setup, entries = search(setup, terms, max_effects, rng, show, EFFORT)
         verdict = judge_entries(setup, entries, None, rng)
         bar.update(100 - bar.n)
     notes = list(deployment.notes)

@@ -146,9 +146,11 @@ class Plant:
         simulator's own error wherever a motion reverses, and larger than an encoder's noise at the usual steps of 2 ms.
         """
         spec = self.spec.copy()
-        spec.option.timestep /= max(1, np.ceil(spec.option.timestep / longest - 1e-9))
+        spec.option.timestep /= max(1, np.ceil(spec.option.timestep / longest - 1e-3))
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
         spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_ISLAND)  # a few joints need none
+        if not (self.model.npair or np.any(self.model.geom_contype) or np.any(self.model.geom_conaffinity)):
+            spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
         for joint in spec.joints:
             stiffen_dry_friction(joint)
         return Plant(spec)

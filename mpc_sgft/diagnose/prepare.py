@@ -47,6 +47,7 @@ class Setup(Generic[P]):
         quiet: An error below which nothing is left to explain.
         parts: Into which each window is cut when sets are compared; a few long windows say more than many short ones.
         stepping: Share of the expected squared error that the simulator's time step makes.
+        near: The fit near which it is right; None where nothing depends on that.
         judged: What of a window's error counts when sets are compared; the error itself by default.
     """
 
@@ -61,6 +62,7 @@ class Setup(Generic[P]):
     quiet: float = -np.inf
     parts: int = 1
     stepping: float = 0.0
+    near: Fit | None = None
 
     def one_window(self, errors: Array) -> bool:
         """Whether several parts of one window may show an effect: where windows are few, and noise alone is left.
@@ -164,7 +166,7 @@ def _setup(
         return np.log1p(np.maximum(errors, least))
 
     floor, stepping = np.median(own.floor[0], (0, 1)), float(problem.floor_shares[0].mean())
-    return Setup(problem, fitted, held, blocks, base, noise, floor, judged, NOISE + QUIET, parts, stepping)
+    return Setup(problem, fitted, held, blocks, base, noise, floor, judged, NOISE + QUIET, parts, stepping, near)
 
 
 def cut(fitted: int) -> Index:

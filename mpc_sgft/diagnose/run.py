@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from mpc_sgft.diagnose import judge, repair
 from mpc_sgft.diagnose.check import check_settings, episodes
 from mpc_sgft.diagnose.entry import Entry
 from mpc_sgft.diagnose.experiment import next_experiment
-from mpc_sgft.diagnose.fit import change_of
+from mpc_sgft.diagnose.fit import Fit, Problem, change_of
 from mpc_sgft.diagnose.flexible import flexible_fit
 from mpc_sgft.diagnose.library import candidates, numbers, sums_of
 from mpc_sgft.diagnose.locate import locate
@@ -26,12 +26,13 @@ from mpc_sgft.diagnose.prepare import Setup, around, prepare, scales
 from mpc_sgft.diagnose.record import Array, Episode, files, read_table
 from mpc_sgft.diagnose.replay import Replayer
 from mpc_sgft.diagnose.report import MAX_CANDIDATES, Report
+from mpc_sgft.diagnose.screen import key_of
 from mpc_sgft.diagnose.search import again, nearest, search
 from mpc_sgft.errors import UserError
 from mpc_sgft.log import progress as bar_of
 
-STEPS = (4 * SHARP, 2 * SHARP, SHARP)  # [s] to search with: the longest whose error noise hides
-UNSEEN = 0.2  # share of the expected squared error that noise hides
+STEPS = (4 * SHARP, 2 * SHARP, SHARP)  # [s] to simulate with: the longest whose error noise hides
+UNSEEN, NOTHING = 0.2, 0.1  # share of the expected squared error that noise hides in a search, and in a judgement
 
 
 def read(plant: Plant, data: Sequence[str | Path]) -> list[Episode]:
@@ -68,10 +69,18 @@ def run(
     check_settings(window, seed, max_effects)
     began, rng = time.perf_counter(), np.random.default_rng(seed)
     nominal = nominal_terms(plant, uncertain)
-    for step in sorted({min(step, recorded[0].dt) for step in STEPS}, reverse=True):
-        setup = prepare(plant.sharper(step), recorded, nominal, window=window, signals=signals, held_out=held_out)
-        if setup.stepping < UNSEEN:
-            break
+    steps = sorted({min(step, recorded[0].dt) for step in STEPS}, reverse=True)
+    setup = _coarsest(
+        (
+            prepare(plant.sharper(step), recorded, nominal, window=window, signals=signals, held_out=held_out)
+            for step in steps
+        ),
+        UNSEEN,
+    )
+
+    def nearer(f: Fit, hidden: float = UNSEEN) -> Setup[Problem]:
+        return _coarsest((around(setup, f, plant.sharper(step)) for step in steps), hidden)
+
     sharp = plant.sharper()
     sizes = scales(sharp, setup.problem.replayer)
     with bar_of(100, desc="diagnose", unit="%", disable=not progress) as bar:
@@ -81,15 +90,16 @@ def run(
             bar.update(max(0, round(90 * share) - bar.n))
 
         terms = candidates(sharp, sizes, effects)
-        entries = search(setup, terms, max_effects, rng, show)
+        first = setup
+        setup, entries = search(first, terms, max_effects, rng, show, nearer=nearer)
         best = choose_set(setup, entries, rng)
         near = best if best.effects else nearest(entries)
-        if near.effects:  # windows began as the nominal model sees it: look again as this set does
-            was, setup = near.error, around(setup, near.fit, sharp)
+        if near.effects and not _sees(setup, near):  # windows began as another set sees it: look again as this one does
+            was, unmoved, setup = near.error, setup is first, nearer(near.fit, NOTHING)
             entries = again(setup, entries, near)
             best = choose_set(setup, entries, rng)
-            if not settled(best) and was - best.error > judge.worth(was):
-                entries = search(setup, terms, max_effects, rng, show)
+            if unmoved and not settled(best) and was - best.error > judge.worth(was):
+                setup, entries = search(setup, terms, max_effects, rng, show)
                 best = choose_set(setup, entries, rng)
         flexible = None if settled(best) else flexible_fit(setup, best, sizes, rng)
         verdict = judge_entries(setup, entries, flexible, rng)
@@ -106,6 +116,19 @@ def run(
     if out is not None:
         report.write(out)
     return report
+
+
+def _coarsest(setups: Iterable[Setup[Problem]], hidden: float) -> Setup[Problem]:
+    """The first of setups in ever shorter steps whose error makes less than this share, or the last."""
+    for setup in setups:
+        if setup.stepping < hidden:
+            break
+    return setup
+
+
+def _sees(setup: Setup[Problem], e: Entry) -> bool:
+    """Whether the problem is right near this set, in steps that are short enough."""
+    return setup.near is not None and key_of(setup, setup.near.terms) == e.key and setup.stepping < NOTHING
 
 
 def assemble(

@@ -42,9 +42,18 @@ class Effort(NamedTuple):
 
 
 class Proposal(NamedTuple):
+    """A set to be fitted.
+
+    Attributes:
+        terms, start: The set, and where its fit starts.
+        cost: Its error there on some windows, as a fit measures it.
+        gain: By how much less its squared residuals sum up to than the best set's, both after a quick fit.
+    """
+
     terms: tuple[Term, ...]
     start: tuple[Array, ...]
     cost: float
+    gain: float = 0.0
 
 
 class Sample(NamedTuple):
@@ -230,13 +239,16 @@ def _overlap(a: Term, b: Term) -> bool:
     return includes(a, b) or includes(b, a)
 
 
-def sharpen(setup: Setup[Any], parent: Entry, ranked: list[Proposal], effort: Effort) -> list[Proposal]:
+def sharpen(setup: Setup[Any], best: Entry, ranked: list[Proposal], effort: Effort) -> list[Proposal]:
     """Order proposals anew after a few iterations on some windows: one step says little of some effects."""
+    if not ranked:
+        return []
     pick, out = spread(setup.fitted, effort.sharpen), []
-    scale = typical(parent.fit.r)
+    scale = typical(best.fit.r)
+    before = float(np.sum(fit(setup.problem, best.fit.terms, best.fit.values, pick, effort.quick).r ** 2))
     for p in ranked:
         f = fit(setup.problem, p.terms, p.start, pick, effort.quick)
-        out.append(Proposal(f.terms, f.values, float(robust(f.r, scale))))
+        out.append(Proposal(f.terms, f.values, float(robust(f.r, scale)), before - float(np.sum(f.r**2))))
     return sorted(out, key=lambda p: p.cost)
 
 

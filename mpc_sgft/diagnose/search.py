@@ -9,7 +9,7 @@ import numpy as np
 
 from mpc_sgft.diagnose import judge
 from mpc_sgft.diagnose.entry import Entry, entry
-from mpc_sgft.diagnose.fit import fit, robust, typical
+from mpc_sgft.diagnose.fit import Fit, fit, robust, typical
 from mpc_sgft.diagnose.library import Term, includes, simplify
 from mpc_sgft.diagnose.prepare import Setup
 from mpc_sgft.diagnose.record import Array
@@ -17,11 +17,14 @@ from mpc_sgft.diagnose.screen import Effort, Proposal, couple, key_of, proposals
 from mpc_sgft.diagnose.table import ALIKE, EQUIVALENT
 
 FIRST, NEXT = (1.0, 0.1, 0.01), (0.3,)  # how far from no effect the fits of a first effect start, and of further ones
-REJUDGED = 6  # sets that are judged anew
-HOPELESS = 3.0  # times the error of a set, after a few iterations on some windows: no full fit
+REJUDGED = 6  # sets that are judged anew, half of them however bad they are
+HOPELESS = 3.0  # times the error of a set, after a few iterations on some windows or of another problem: no full fit
 MUCH = 0.05  # share of the squared error above noise, left of a set: its effects are exchanged for any others
 WIDE = 2  # times as many sets that extend one that leaves noise alone: what more there is, is small
 PAIR = 2  # effects, of the largest set that is looked for where a smaller one leaves noise alone
+CHANCE = (
+    3.0  # fall of the sum of squares in a quick fit, in noise's units: with less, no full fit where noise alone is left
+)
 STARTS = 2  # of each richer set that get a quick fit
 SWAPPED = 2  # of the best sets, in which effects are exchanged for those that start well where they end
 
@@ -35,8 +38,9 @@ def search(
     rng: np.random.Generator,
     report: Callable[[str, float], None] = lambda what, done: None,
     effort: Effort = Effort(),  # noqa: B008, it is a tuple
-) -> list[Entry]:
-    """All sets that were fitted, baseline first.
+    nearer: Callable[[Fit], Setup[Any]] | None = None,
+) -> tuple[Setup[Any], list[Entry]]:
+    """All sets that were fitted, baseline first, and the problem that they were fitted to.
 
     Args:
         setup: Problem and baseline.
@@ -45,6 +49,7 @@ def search(
         rng: For the bootstrap that decides whether to go on.
         report: Told what is being done, and the share that is done.
         effort: How widely.
+        nearer: The problem as a fit sees it: where one effect leaves more than noise, the search goes on in that.
     """
     found = {frozenset(): entry(setup, setup.baseline)}
     beam, best, pairs = list(found.values()), found[frozenset()], []
@@ -61,22 +66,30 @@ def search(
             new |= promising(setup, parent, ranked, full, found | new, effort)
         if level == 1:
             left = [p for p in pairs if key_of(setup, p.terms) not in new]
-            new |= promising(setup, found[frozenset()], left, full, {}, effort)
+            new |= promising(setup, found[frozenset()], left, full, {}, effort, best)
         new = {key: no_worse(setup, e, found, effort) for key, e in new.items()}
         found |= new
         if not new:
             break
-        beam = sorted(new.values(), key=lambda e: e.error)[: effort.beam[min(level, len(effort.beam) - 1)]]
+        count = effort.beam[min(level, len(effort.beam) - 1)]
+        beam = sorted(new.values(), key=lambda e: e.error)[:count]
         if judge.credible(best.errors, beam[0].errors, rng, setup.parts, one_window=setup.one_window(beam[0].errors)):
             best = beam[0]
         elif level or best.error <= effort.enough:
             break
+        else:
+            beam = beam[:1]  # pairs may do what nothing does alone
+        if nearer and level == 0 and best.effects and best.error >= setup.quiet:
+            setup = nearer(best.fit)
+            found = {e.key: e for e in again(setup, list(found.values()), best)}
+            beam = sorted((e for e in found.values() if e.effects), key=lambda e: e.error)[:count]
+            best = beam[0]
         if best.error < setup.quiet:
             beam, most, wide = beam[:1], min(most, PAIR), WIDE
     best = min(found.values(), key=lambda e: e.error)
     if effort.exchange and best.effects > 1 and judge.leaves(best.error, found[frozenset()].error, MUCH):
         found |= exchange(setup, best, found, terms, effort)
-    return list((found | swaps(setup, found, terms, effort)).values())
+    return setup, list((found | swaps(setup, found, terms, effort)).values())
 
 
 def promising(
@@ -86,6 +99,7 @@ def promising(
     full: int,
     found: Mapping[frozenset[str], Entry],
     effort: Effort,
+    best: Entry | None = None,
 ) -> dict[frozenset[str], Entry]:
     """Full fits of the best proposals, those that are new or better than before.
 
@@ -96,7 +110,9 @@ def promising(
         full: How many get a full fit, beside richer effects in place of simpler ones; twice as many get a quick one.
         found: What was fitted already; from a simpler set's optimum, a richer set is fitted once more.
         effort: How widely.
+        best: Whose residuals they must better; the parent's by default.
     """
+    best = best or parent
     starts: dict[frozenset[str], list[Proposal]] = {}  # of sets in which an effect becomes a richer one
     for p in (p for p in ranked if len(p.terms) == len(parent.fit.terms)):
         starts.setdefault(key_of(setup, p.terms), []).append(p)
@@ -104,10 +120,11 @@ def promising(
     others = [p for p in ranked if len(p.terms) > len(parent.fit.terms)][: 2 * full]
     new: dict[frozenset[str], Entry] = {}
     for some, count in ((richer, len(starts)), (others, full)):
-        best: dict[frozenset[str], Proposal] = {}
-        for p in sharpen(setup, parent, some, effort):
-            best.setdefault(key_of(setup, p.terms), p)
-        for key, proposal in list(best.items())[:count]:
+        sets: dict[frozenset[str], Proposal] = {}
+        for p in sharpen(setup, best, some, effort):
+            if some is richer or not sets or best.error > setup.quiet or p.gain > CHANCE:
+                sets.setdefault(key_of(setup, p.terms), p)
+        for key, proposal in list(sets.items())[:count]:
             if key in found and some is others:
                 continue
             fitted = entry(setup, fit(setup.problem, proposal.terms, proposal.start, setup.fitted, effort.last))
@@ -171,6 +188,8 @@ def again(setup: Setup[Any], entries: Sequence[Entry], best: Entry) -> list[Entr
     rivals = sorted((e for e in entries[1:] if e.effects <= best.effects), key=lambda e: e.error)[:REJUDGED]
     larger = sorted((e for e in entries[1:] if e.effects > best.effects), key=lambda e: e.error)[: REJUDGED // 3]
     parts = [e for e in entries[1:] if e.key < best.key]
+    enough = best.error + np.log(HOPELESS)
+    rivals = [e for i, e in enumerate(rivals) if i < REJUDGED // 2 or e.error < enough]
     kept = {e.key: e for e in [best, *rivals, *parts, *larger]}
     fits = (fit(setup.problem, e.fit.terms, e.fit.values, setup.fitted) for e in kept.values())
     return [entry(setup, setup.baseline), *(entry(setup, f) for f in fits)]

@@ -42,6 +42,16 @@ def test_a_right_model_predicts_to_the_second_order(plant) -> None:
     assert np.abs(error).max() < 3e-6  # the first order alone would be h a t / 2 = 5e-4 m
 
 
+def test_a_model_that_the_data_contradict_is_simulated_to_the_second_order_too(plant) -> None:
+    """Its acceleration at a start is not the measured one, and its damping is not that of the scene."""
+    change, off = make_term(plant, "viscous_friction", "x", Scales()).build(np.array([3.0])), []
+    true = Replayer(plant.sharper(2e-5), [_sine()], 0.5, ["qpos/x"])
+    for h in (2e-3, 1e-3):
+        coarse = true.of(plant.sharper(h))
+        off.append(float(np.abs(coarse.simulate([change]) - true.simulate([change])).max()))
+    assert off[0] < 1e-6 and off[0] / off[1] > 2.5, off  # the first order makes 1.6e-4 m, and halves
+
+
 def test_what_shorter_steps_would_change_is_known() -> None:
     """Beside dry friction that a motion reverses against, an error of the first order."""
     spec = mujoco.MjSpec.from_string(SLIDE.replace('axis="1 0 0"/>', 'axis="1 0 0" frictionloss="1"/>'))

@@ -12,7 +12,7 @@ import pytest
 from mpc_sgft.diagnose import screen as screening
 from mpc_sgft.diagnose import search as searching
 from mpc_sgft.diagnose.entry import Entry, entry
-from mpc_sgft.diagnose.fit import fit
+from mpc_sgft.diagnose.fit import Fit, fit
 from mpc_sgft.diagnose.flexible import Flexible
 from mpc_sgft.diagnose.library import Term, as_gap, candidates, settings, simplify
 from mpc_sgft.diagnose.name import caution, gains, holds, judge_entries
@@ -58,7 +58,8 @@ def found(pairs: int) -> list[set[str]]:
     none = np.zeros(1)
     setup = Setup(problem, fitted, np.arange(18, 24), fitted // 3, base, none, none, np.log1p, NOISE)
     terms = [term(name) for name in "abcdefghxy"]
-    entries = search(setup, terms, 2, np.random.default_rng(0), effort=Effort(beam=(1,), full=(1, 1, 1), pairs=pairs))
+    effort = Effort(beam=(1,), full=(1, 1, 1), pairs=pairs)
+    _, entries = search(setup, terms, 2, np.random.default_rng(0), effort=effort)
     return [set(e.names) for e in entries if e.error < NOISE + 0.1]
 
 
@@ -72,11 +73,50 @@ def test_a_small_second_effect_is_found_where_the_first_leaves_less_than_the_noi
     problem.y = 3 * c["a"] + 0.4 * c["b"] + 0.8 * np.random.default_rng(3).normal(size=problem.y.shape)
     base, rng = fit(problem, [], [], fitted), np.random.default_rng(0)
     setup = Setup(problem, fitted, np.arange(18, 24), fitted // 3, base, none, none, np.log1p, NOISE)
-    entries = search(setup, [term(name) for name in "abcdefgh"], 2, rng)
+    _, entries = search(setup, [term(name) for name in "abcdefgh"], 2, rng)
     assert next(e.error for e in entries if e.names == ["a"]) < setup.quiet
     verdict = judge_entries(setup, entries, None, rng)
     assert (verdict.kind, sorted(verdict.best.names)) == ("effect", ["a", "b"])
-    assert max(e.effects for e in search(setup, [term(x) for x in "abcdefgh"], 3, rng)) == 2  # nor a third
+    assert max(e.effects for e in search(setup, [term(x) for x in "abcdefgh"], 3, rng)[1]) == 2  # nor a third
+
+
+def test_further_effects_are_sought_in_the_problem_as_the_first_sees_it() -> None:
+    """Far from the first effect, the problem errs so that another would take that away."""
+    fitted, none, rng = np.arange(18), np.zeros(1), np.random.default_rng(0)
+    far, near = Lines(), Lines()
+    near.y = 30 * near.columns["b"] + rng.normal(size=near.y.shape)
+    far.y = near.y + 3 * far.columns["c"]
+    far.columns |= {"a": near.columns["a"]}
+    setups = [
+        Setup(p, fitted, np.arange(18, 24), fitted // 3, fit(p, [], [], fitted), none, none, np.log1p, NOISE + 0.05)
+        for p in (far, near)
+    ]
+    asked: list[list[str]] = []
+
+    def nearer(f: Fit) -> Setup[Lines]:
+        asked.append([t.effect for t in f.terms])
+        return setups[1]
+
+    terms = [term(name) for name in "bcdefgh"]
+    assert searched(setups[0], terms, rng) == [["b", "c"]]
+    setup, entries = search(setups[0], terms, 2, rng, nearer=nearer)
+    assert setup is setups[1] and asked == [["b"]] and not entries[0].effects
+    assert judge_entries(setup, entries, None, rng).best.names == ["b"]
+
+
+def searched(setup: Setup[Lines], terms: Sequence[Term], rng: np.random.Generator) -> list[list[str]]:
+    setup, entries = search(setup, terms, 2, rng)
+    return [sorted(judge_entries(setup, entries, None, rng).best.names)]
+
+
+def test_what_gains_no_more_than_chance_gets_no_full_fit_where_noise_alone_is_left() -> None:
+    problem, fitted, none = Lines(), np.arange(18), np.zeros(1)
+    problem.y = np.random.default_rng(3).normal(size=problem.y.shape)
+    base = fit(problem, [], [], fitted)
+    for quiet, counts in ((NOISE + 0.05, (1, 2)), (0.0, (5,))):
+        setup = Setup(problem, fitted, np.arange(18, 24), fitted // 3, base, none, none, np.log1p, quiet)
+        _, entries = search(setup, [term(name) for name in "bcdefgh"], 1, np.random.default_rng(0))
+        assert sum(e.effects for e in entries) in counts
 
 
 @pytest.mark.parametrize("exchange", [0, 2])
@@ -89,7 +129,7 @@ def test_an_effect_that_stood_in_for_two_makes_way_for_them(exchange: int) -> No
     setup = Setup(problem, fitted, np.arange(18, 24), fitted // 3, base, none, none, np.log1p, NOISE)
     terms = [term(name) for name in "abcefgh"]
     effort = Effort(beam=(1,), full=(1, 1, 1), pairs=0, exchange=exchange)
-    entries = search(setup, terms, 2, np.random.default_rng(0), effort=effort)
+    _, entries = search(setup, terms, 2, np.random.default_rng(0), effort=effort)
     assert [set(e.names) for e in entries if e.error < NOISE + 0.1] == [{"b", "c"}] * bool(exchange)
 
 
