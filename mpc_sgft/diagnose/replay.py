@@ -33,6 +33,7 @@ THREADS = int(os.environ.get("OMP_NUM_THREADS", len(os.sched_getaffinity(0))))
 NOTHING = mujoco.MjSpec().compile()
 SIZES = [n for n in dir(NOTHING) if n[0] == "n" and isinstance(getattr(NOTHING, n), int)]  # of all arrays of a model
 LEAD = 0.3  # [s] before a window, to find how rotors lean and bristles bend at its start
+STIFF = 0.2  # of a joint's inertia
 EXPLODED = 1e6  # predictions are clipped here, so that an unstable candidate is bad, not infinite
 
 
@@ -102,12 +103,15 @@ class Replayer:
         """A model whose joint damping acts at the mean of the speeds before and after a step, not at the one after.
 
         h d / 2 less armature does the same: (M - h d / 2) dv / h = F - d (v + dv) is M dv / h = F - d (v + dv / 2).
+        Where that is much of the inertia, damping is stiff, and only part of it is done, for M to stay positive.
         """
-        if not self.half or not model.dof_damping.any():
+        less = self.half * model.dof_damping
+        if not less.any():
             return model
+        less *= min(1.0, STIFF / float(less @ model.dof_invweight0))
         out = copy.copy(model)
         for inertia in (out.dof_armature, out.dof_M0):  # the latter is of joints whose inertia is constant
-            inertia -= self.half * out.dof_damping
+            inertia -= less
         return out
 
     def of(self, plant: Plant) -> Replayer:

@@ -52,6 +52,16 @@ def test_a_model_that_the_data_contradict_is_simulated_to_the_second_order_too(p
     assert off[0] < 1e-6 and off[0] / off[1] > 2.5, off  # the first order makes 1.6e-4 m, and halves
 
 
+def test_damping_that_is_stiff_stays_stable(plant) -> None:
+    """A time constant of half a millisecond at steps of two: the slide creeps with u / d."""
+    episode, stiff = _sine(), make_term(plant, "viscous_friction", "x", Scales()).build(np.array([4000.0]))
+    still = replace(episode, signals={"qpos/x": 0 * episode.signals["qpos/x"]})
+    replayer = Replayer(plant, [still], 0.5, ["qpos/x"])
+    t = replayer.windows.start[:, None] * 0.001 + 0.001 * np.arange(501)
+    crept = 2 / 4000 / 3 * (np.cos(3 * t[:, :1]) - np.cos(3 * t[:, 1:]))
+    np.testing.assert_allclose(replayer.simulate([stiff])[0, ..., 0], crept, atol=5e-6)
+
+
 def test_what_shorter_steps_would_change_is_known() -> None:
     """Beside dry friction that a motion reverses against, an error of the first order."""
     spec = mujoco.MjSpec.from_string(SLIDE.replace('axis="1 0 0"/>', 'axis="1 0 0" frictionloss="1"/>'))
