@@ -5,7 +5,7 @@
                                     [--no-baselines] [--pack results/blind_reports.jsonl.gz]
 
 The labels' SHA-256 is printed before the solver starts, and checked before scoring. A seed that was used to tune the
-solver must not be reported: 11, 901 to 905 and 20261121 to 20261127 so far.
+solver must not be reported: 11, 901 to 905 and 20261121 to 20261128 so far.
 Everything is resumable: what is on disk is not done again, nor what --pack holds, a file of all reports that is read
 before the solver starts and written when it ends, or at once with --only pack, also while it runs. The CSV has one
 row a score; beside it go <csv>_cases.csv with one row a case, <csv>_confusion.png and <csv>_power.png.
