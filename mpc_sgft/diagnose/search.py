@@ -22,9 +22,7 @@ HOPELESS = 3.0  # times the error of a set, after a few iterations on some windo
 MUCH = 0.05  # share of the squared error above noise, left of a set: its effects are exchanged for any others
 WIDE = 2  # times as many sets that extend one that leaves noise alone: what more there is, is small
 PAIR = 2  # effects, of the largest set that is looked for where a smaller one leaves noise alone
-CHANCE = (
-    3.0  # fall of the sum of squares in a quick fit, in noise's units: with less, no full fit where noise alone is left
-)
+CHANCE = 3.0  # less fall of the sum of squares in a quick fit, in noise's units: no full fit where noise alone is left
 STARTS = 2  # of each richer set that get a quick fit
 SWAPPED = 2  # of the best sets, in which effects are exchanged for those that start well where they end
 

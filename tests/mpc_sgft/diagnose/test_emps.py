@@ -8,21 +8,34 @@ import mujoco
 import numpy as np
 import pytest
 
+from mpc_sgft.diagnose import judge
+from mpc_sgft.diagnose.entry import Entry, entry
 from mpc_sgft.diagnose.fit import change_of, fit
 from mpc_sgft.diagnose.library import make_term
 from mpc_sgft.diagnose.nominal import nominal_terms
 from mpc_sgft.diagnose.plant import Plant
-from mpc_sgft.diagnose.prepare import prepare, scales
+from mpc_sgft.diagnose.prepare import Setup, prepare, scales
 from tools import emps
 
 
-def test_asymmetric_viscous_and_coulomb_friction_predict_both_held_out_recordings(data_dir: Path) -> None:
+def _problem(data_dir: Path) -> tuple[Plant, Setup]:
     plant = Plant(mujoco.MjSpec.from_string(emps.SCENE))
     nominal = nominal_terms(plant, {"mass": 0.3})
-    setup = prepare(plant, emps.thirds(data_dir), nominal, window=0.5, signals=None, held_out=["second", "pulses"])
-    at = scales(plant, setup.problem.replayer)["joint", "x"]
-    terms = [*nominal, *(make_term(plant, n, "x", at) for n in ("asymmetric_friction", "coulomb_friction"))]
-    f = fit(setup.problem, terms, [*setup.baseline.values, *(t.starts[0] for t in terms[1:])], setup.fitted)
+    held_out = ["second", "pulses"]
+    return plant, prepare(plant, emps.thirds(data_dir), nominal, window=0.5, signals=None, held_out=held_out)
+
+
+def _fitted(plant: Plant, setup: Setup, *places: tuple[str, str, str]) -> Entry:
+    """Fit of the mass and of effects, each by name, kind of place and place."""
+    at = scales(plant, setup.problem.replayer)
+    terms = [make_term(plant, name, place, at[kind, place]) for name, kind, place in places]
+    start = [*setup.baseline.values, *(t.starts[0] for t in terms)]
+    return entry(setup, fit(setup.problem, [*setup.baseline.terms, *terms], start, setup.fitted))
+
+
+def test_asymmetric_viscous_and_coulomb_friction_predict_both_held_out_recordings(data_dir: Path) -> None:
+    plant, setup = _problem(data_dir)
+    f = _fitted(plant, setup, ("asymmetric_friction", "joint", "x"), ("coulomb_friction", "joint", "x")).fit
     replayer = setup.problem.replayer
     error = replayer.simulate([change_of(f.terms, f.values)])[0] - replayer.windows.measured
     first, second, pulses = (1e3 * np.sqrt((error[replayer.windows.episode == i] ** 2).mean()) for i in range(3))
@@ -30,6 +43,18 @@ def test_asymmetric_viscous_and_coulomb_friction_predict_both_held_out_recording
     np.testing.assert_allclose(f.values[1], [166.7, 240.4], rtol=0.06)  # published, by another method
     np.testing.assert_allclose(f.values[2], 20.4, rtol=0.06)
     assert f.values[0][0] * 95 == pytest.approx(95.11, rel=0.03)
+
+
+@pytest.mark.parametrize(("friction", "credible"), [("viscous_friction", True), ("asymmetric_friction", False)])
+def test_an_offset_is_credible_only_where_the_asymmetry_is_left_out(
+    data_dir: Path, friction: str, credible: bool
+) -> None:
+    plant, setup = _problem(data_dir)
+    known = (friction, "joint", "x"), ("coulomb_friction", "joint", "x")
+    without = _fitted(plant, setup, *known)
+    beside = _fitted(plant, setup, *known, ("actuator_offset", "actuator", "motor"))
+    rng = np.random.default_rng(0)
+    assert judge.credible(without.errors, beside.errors, rng, setup.parts) == credible
 
 
 @pytest.mark.slow
