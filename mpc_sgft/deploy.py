@@ -5,11 +5,11 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
-from mpc_sgft import cli
+from mpc_sgft.command import cli
 
 COMMAND = cli.Command(
     name="deploy",
-    loop="mpc_sgft.deploy_loop:deploy",
+    loop="mpc_sgft.runs.deploy:deploy",
     summary="Deploy a pretrained agent: roll out with the planner, train dynamics and policy prior in between,\n"
     "keep the critic of the simulation frozen (SGFT). Starts from the shipped checkpoint unless one is given.",
     overrides={

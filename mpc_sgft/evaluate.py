@@ -5,11 +5,11 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
-from mpc_sgft import cli
+from mpc_sgft.command import cli
 
 COMMAND = cli.Command(
     name="evaluate",
-    loop="mpc_sgft.evaluate_loop:evaluate",
+    loop="mpc_sgft.runs.evaluate:evaluate",
     summary="Evaluate a checkpoint, or a fixed policy, on any task and gap: success with an interval, return, JSON.",
     overrides={"episodes": "how many", "horizon": "steps the planner looks ahead (planner.horizon)"},
     values={"policy": ("planner", "zero", "random", "scripted")},

@@ -5,11 +5,11 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
-from mpc_sgft import cli
+from mpc_sgft.command import cli
 
 COMMAND = cli.Command(
     name="pretrain",
-    loop="mpc_sgft.pretrain_loop:pretrain",
+    loop="mpc_sgft.runs.pretrain:pretrain",
     summary="Pretrain a latent world model, a policy prior and a critic in randomised MuJoCo simulation.\n"
     "Ctrl-C saves; --resume goes on exactly where it stopped.",
 )

@@ -90,7 +90,7 @@ def robot_push() -> Push:
     import yaml
 
     from envs.tasks.push import Push
-    from mpc_sgft.choices import CONFIG_DIR
+    from mpc_sgft.command.choices import CONFIG_DIR
 
     settings = yaml.safe_load((CONFIG_DIR / "task" / "push.yaml").read_text())
     env = {**settings["env"], **settings["on_robot"]}

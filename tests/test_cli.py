@@ -13,8 +13,9 @@ import yaml
 from omegaconf import OmegaConf
 
 from envs.effects import available
-from mpc_sgft import choices, cli, compose, run_folder
-from mpc_sgft.errors import Stopped, UserError, from_config
+from mpc_sgft.command import choices, cli, compose
+from mpc_sgft.command.errors import Stopped, UserError, from_config
+from mpc_sgft.storage import run_folder
 
 ROOT = Path(__file__).resolve().parents[1]
 COMMANDS = ("pretrain", "deploy", "evaluate")
@@ -30,8 +31,8 @@ def loops(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A module of small loops beside an empty working folder, which it returns."""
     (tmp_path / "probe_loop.py").write_text(
         "import errno\n"
-        "from mpc_sgft import run_folder\n"
-        "from mpc_sgft.errors import Stopped\n"
+        "from mpc_sgft.storage import run_folder\n"
+        "from mpc_sgft.command.errors import Stopped\n"
         "def folder(cfg):\n    print(run_folder.start(cfg))\n"
         "def show(cfg):\n    print(cfg.seed, cfg.chosen.gap, cfg.planner.horizon)\n"
         "def stop(cfg):\n    raise Stopped('Saved. Go on with: --resume runs/x')\n"

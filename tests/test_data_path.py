@@ -6,8 +6,8 @@ import torch
 
 from envs.backends.base import Outcome
 from envs.env import ControlEnv
-from mpc_sgft.buffer import make_buffer
-from mpc_sgft.rollout import collect, score
+from mpc_sgft.learning.buffer import make_buffer
+from mpc_sgft.runs.collect import collect, score
 
 
 class Counter:

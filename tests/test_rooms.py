@@ -20,6 +20,17 @@ MAY_IMPORT = {
     "tests": OURS - {"tests"},
 }
 
+ROOMS = {  # of mpc_sgft, lowest first: each may import itself and what is named here
+    "command": set(),
+    "learning": set(),
+    "methods": {"learning"},
+    "storage": {"command", "learning"},
+    "session": {"command", "storage"},
+    "views": {"command", "learning", "storage"},
+    "runs": {"command", "learning", "methods", "storage", "session", "views"},
+    "diagnose": {"command", "learning", "methods", "storage", "views", "runs"},
+}
+
 
 def imported(source: str) -> set[str]:
     """Top-level names of everything a module imports; a relative import counts as "."."""
@@ -44,6 +55,49 @@ def test_imports_point_one_way(room: str) -> None:
             if name == "." or (name in OURS and name not in MAY_IMPORT[room]):
                 wrong.append(f"{path.relative_to(ROOT)} imports {name}")
     assert not wrong, wrong
+
+
+def module_of(path: Path) -> str:
+    return ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+
+
+def modules_imported(source: str, known: set[str]) -> set[str]:
+    """Those of `known` that a module imports, at its top or inside a function."""
+    found = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            base = node.module or ""
+            found |= {f"{base}.{a.name}" if f"{base}.{a.name}" in known else base for a in node.names}
+    return found & known
+
+
+def graph(rooms: tuple[str, ...]) -> dict[str, set[str]]:
+    """Who imports whom among our modules; a package's own `__init__` may gather what is in it."""
+    paths = {module_of(p): p for room in rooms for p in files(room)}
+    return {name: modules_imported(p.read_text(), set(paths)) - {name} for name, p in paths.items()}
+
+
+def test_the_rooms_of_mpc_sgft_point_one_way() -> None:
+    inside = {p.name for p in (ROOT / "mpc_sgft").iterdir() if (p / "__init__.py").is_file()}
+    assert inside == set(ROOMS)
+    wrong = []
+    for name, others in graph(("mpc_sgft",)).items():
+        room = name.split(".")[1] if name.count(".") > 1 else name.removeprefix("mpc_sgft.")
+        allowed = {room} | ROOMS[room] if room in ROOMS else {"command"}  # the entry points parse, then start a loop
+        for other in others - {"mpc_sgft"}:
+            if other.split(".")[1] not in allowed:
+                wrong.append(f"{name} imports {other}")
+    assert not wrong, wrong
+
+
+def test_no_modules_import_each_other_in_a_circle() -> None:
+    left = graph(("envs", "planners", "mpc_sgft", "tools"))
+    while left:
+        last = {name for name, others in left.items() if not others & set(left)}
+        assert last, {name: others & set(left) for name, others in left.items()}
+        left = {name: others for name, others in left.items() if name not in last}
 
 
 @pytest.mark.parametrize("room", ["envs", "planners"])

@@ -30,7 +30,7 @@ from hydra.utils import instantiate
 
 from envs.backends.sim import SimBackend
 from envs.env import ControlEnv
-from mpc_sgft.run_folder import cpu_name
+from mpc_sgft.storage.run_folder import cpu_name
 
 ROOT = Path(__file__).resolve().parents[1]
 N, THREADS, BAR = 64, 2, 0.8

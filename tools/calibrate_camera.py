@@ -27,8 +27,8 @@ from envs.perception.base import Array, PerceptionError
 from envs.perception.calibration import Calibration, check_pose, transform
 from envs.perception.extra import load
 from envs.perception.intrinsics import Intrinsics
-from mpc_sgft.errors import UserError, disk_error
-from mpc_sgft.whole_file import write_whole
+from mpc_sgft.command.errors import UserError, disk_error
+from mpc_sgft.storage.whole_file import write_whole
 
 NAME = "pairs.json"
 

@@ -16,7 +16,7 @@ import torch
 from hydra import compose, initialize_config_module
 
 from envs.env import ControlEnv
-from mpc_sgft.build import make_env
+from mpc_sgft.runs.build import make_env
 
 N = 64
 HELD = 10  # control steps

@@ -13,9 +13,10 @@ from pathlib import Path
 
 import torch
 
-from mpc_sgft import build, compose
-from mpc_sgft.pretrain_loop import EVAL_SEED
-from mpc_sgft.rollout import collect, planner_policy
+from mpc_sgft.command import compose
+from mpc_sgft.runs import build
+from mpc_sgft.runs.collect import collect, planner_policy
+from mpc_sgft.runs.pretrain import EVAL_SEED
 
 PUCK_X = [0.1, 0.3, 0.5, 0.55, 0.6, 0.65]  # [m]; the line is at 0.55
 

@@ -19,11 +19,11 @@ import mujoco
 import numpy as np
 from scipy.io import loadmat
 
+from mpc_sgft.command.errors import UserError
 from mpc_sgft.diagnose.plant import Plant
 from mpc_sgft.diagnose.record import Episode
 from mpc_sgft.diagnose.report import Report
 from mpc_sgft.diagnose.run import run
-from mpc_sgft.errors import UserError
 
 SCENE = """<mujoco><option timestep="0.001"/><worldbody><body name="carriage">
 <joint name="x" type="slide" axis="1 0 0"/><geom size="0.1" mass="95"/></body></worldbody>

@@ -20,12 +20,13 @@ import numpy as np
 from envs.backends.base import BackendError
 from envs.backends.clock import make_clock
 from envs.backends.franka import FrankaBackend
-from mpc_sgft import compose, robot
-from mpc_sgft.errors import UserError
-from mpc_sgft.log import progress
-from mpc_sgft.operator import Nobody
-from mpc_sgft.run_folder import versions
-from mpc_sgft.whole_file import write_whole
+from mpc_sgft.command import compose
+from mpc_sgft.command.errors import UserError
+from mpc_sgft.runs import robot
+from mpc_sgft.session.operator import Nobody
+from mpc_sgft.storage.metrics import progress
+from mpc_sgft.storage.run_folder import versions
+from mpc_sgft.storage.whole_file import write_whole
 
 PATIENT = ("backend.limits.state_age=5", "backend.limits.detection_age=5", "backend.patience=5")
 GIVE_UP = 3  # resets in a row that do not arrive

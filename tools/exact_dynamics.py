@@ -21,11 +21,11 @@ from torch import Tensor
 from envs.effects.sensor_delay import SensorDelay
 from envs.env import ControlEnv
 from envs.task import Array
-from mpc_sgft import build
-from mpc_sgft.compose import compose
-from mpc_sgft.pretrain_loop import EVAL_SEED
-from mpc_sgft.rollout import collect, planner_policy, score
-from mpc_sgft.world_model import WorldModel
+from mpc_sgft.command.compose import compose
+from mpc_sgft.learning.world_model import WorldModel
+from mpc_sgft.runs import build
+from mpc_sgft.runs.collect import collect, planner_policy, score
+from mpc_sgft.runs.pretrain import EVAL_SEED
 
 COLUMNS = ["gap", "horizon", "reward", "episodes", "success", "success_low", "success_high", "episode_return"]
 

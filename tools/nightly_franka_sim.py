@@ -25,9 +25,9 @@ from hydra.utils import instantiate
 
 from envs.fr3 import add_fr3
 from envs.tasks.push import TOOL_LENGTH, TOOL_RADIUS
-from mpc_sgft import compose
-from mpc_sgft.errors import UserError
-from mpc_sgft.whole_file import write_whole
+from mpc_sgft.command import compose
+from mpc_sgft.command.errors import UserError
+from mpc_sgft.storage.whole_file import write_whole
 from tools import endure
 
 PACKAGE, PORT = "franka-sim==1.1.7", 1337

@@ -14,7 +14,7 @@ import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from mpc_sgft.run_folder import cpu_name
+from mpc_sgft.storage.run_folder import cpu_name
 
 COLUMNS = "task seed transitions updates episodes_evaluated success success_low success_high prior_success".split()
 COLUMNS += ["wall_seconds"]

@@ -11,8 +11,8 @@ import numpy as np
 from envs.perception.base import PerceptionError
 from envs.perception.camera import Frame, RealSense
 from envs.perception.extra import load
-from mpc_sgft.errors import UserError
-from mpc_sgft.whole_file import write_whole
+from mpc_sgft.command.errors import UserError
+from mpc_sgft.storage.whole_file import write_whole
 
 AT_REST = 0.01  # [rad/s] of the fastest joint
 WAIT_S = 2.0  # [s] for a picture that was taken after the key was pressed

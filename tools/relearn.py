@@ -16,15 +16,15 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from tensordict import TensorDict
 
-from mpc_sgft import build
-from mpc_sgft.deploy_loop import make_transfer
-from mpc_sgft.drive import from_episode
-from mpc_sgft.errors import UserError
-from mpc_sgft.log import progress
-from mpc_sgft.pretrain_loop import EVAL_SEED
-from mpc_sgft.record import read_episode
-from mpc_sgft.rollout import collect, planner_policy, score
-from mpc_sgft.transfer import Transfer
+from mpc_sgft.command.errors import UserError
+from mpc_sgft.learning.transfer import Transfer
+from mpc_sgft.runs import build
+from mpc_sgft.runs.collect import collect, planner_policy, score
+from mpc_sgft.runs.deploy import make_transfer
+from mpc_sgft.runs.pretrain import EVAL_SEED
+from mpc_sgft.storage.episode_file import read_episode
+from mpc_sgft.storage.metrics import progress
+from mpc_sgft.storage.rollout import from_episode
 
 COLUMNS = ["run", "gap", "settings", "seed", "rollouts", "success", "episodes"]
 

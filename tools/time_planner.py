@@ -24,9 +24,9 @@ from hydra.utils import instantiate
 from omegaconf import OmegaConf
 from tensordict import TensorDict
 
-from mpc_sgft.agent import Agent
-from mpc_sgft.rollout import planner_policy
-from mpc_sgft.world_model import WorldModel
+from mpc_sgft.learning.agent import Agent
+from mpc_sgft.learning.world_model import WorldModel
+from mpc_sgft.runs.collect import planner_policy
 from planners.memory import keep_freed_memory
 from planners.mppi import MPPI
 

@@ -15,6 +15,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from difflib import get_close_matches
 from functools import cache
+from pathlib import Path
 from typing import Any, ClassVar
 
 import mujoco
@@ -109,9 +110,8 @@ class Effect:
 @cache
 def available() -> tuple[str, ...]:
     """Names of the effects, which are the names of the files in this folder."""
-    import envs.effects as package
-
-    return tuple(sorted(m.name for m in pkgutil.iter_modules(package.__path__) if m.name not in ("base", "passive")))
+    folder = str(Path(__file__).parent)
+    return tuple(sorted(m.name for m in pkgutil.iter_modules([folder]) if m.name not in ("base", "passive")))
 
 
 Parameters = Mapping[str, Any] | None

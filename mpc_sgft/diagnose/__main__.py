@@ -42,7 +42,7 @@ def parser() -> argparse.ArgumentParser:
 def main(argv: list[str] | None = None) -> int:
     """Exit code 0 for every verdict, 2 for bad input, 3 if training met a number that is not finite, 130 for Ctrl-C."""
     args = parser().parse_args(argv)
-    from mpc_sgft.errors import UserError, disk_error
+    from mpc_sgft.command.errors import UserError, disk_error
 
     try:
         return _run(args)
@@ -64,8 +64,8 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _run(args: argparse.Namespace) -> int:
+    from mpc_sgft.command.errors import UserError
     from mpc_sgft.diagnose import diagnose
-    from mpc_sgft.errors import UserError
 
     if args.run is not None:
         return _run_folder(args)
@@ -94,8 +94,8 @@ def _run(args: argparse.Namespace) -> int:
 
 
 def _run_folder(args: argparse.Namespace) -> int:
+    from mpc_sgft.command.errors import UserError
     from mpc_sgft.diagnose.deployed import diagnose_run
-    from mpc_sgft.errors import UserError
 
     for name in ("model", "data", "signals", "uncertain"):
         if getattr(args, name) is not None:
@@ -145,7 +145,7 @@ def _held_out(text: str | None) -> float | list[str] | None:
 
 
 def _shares(text: str | None) -> dict[str, float]:
-    from mpc_sgft.errors import UserError
+    from mpc_sgft.command.errors import UserError
 
     shares = {}
     for item in _names(text) or []:

@@ -8,10 +8,10 @@ from difflib import get_close_matches
 import numpy as np
 from scipy.interpolate import CubicSpline
 
+from mpc_sgft.command.errors import UserError
 from mpc_sgft.diagnose.plant import Axis
 from mpc_sgft.diagnose.record import MIN_SAMPLES, Array, Episode, Index, Table
 from mpc_sgft.diagnose.units import check_order, check_speeds, check_units
-from mpc_sgft.errors import UserError
 
 KINDS = ("qpos", "qvel", "force", "sensor")
 GAP = 3.5  # a pause longer than this many sample times starts a new episode

@@ -28,7 +28,7 @@ from mpc_sgft.diagnose.run import candidate_rows, effect_rows, reduction
 from mpc_sgft.diagnose.screen import Effort
 from mpc_sgft.diagnose.search import search
 from mpc_sgft.diagnose.suspects import gap_of, suspects
-from mpc_sgft.log import progress as bar_of
+from mpc_sgft.storage.metrics import progress as bar_of
 
 LENGTH = 6  # control steps in a window
 MOST = 64  # windows

@@ -18,10 +18,10 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from envs.task import AbstractTask
+from mpc_sgft.command.errors import UserError, from_config
 from mpc_sgft.diagnose.plant import SCALAR
 from mpc_sgft.diagnose.record import Array
-from mpc_sgft.errors import UserError, from_config
-from mpc_sgft.record import Episode, read_episode
+from mpc_sgft.storage.episode_file import Episode, read_episode
 
 MIN_STEPS = 10  # control steps; a shorter episode holds no window
 

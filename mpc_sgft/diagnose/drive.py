@@ -17,10 +17,10 @@ from envs.effects.actuator_delay import ActuatorDelay
 from envs.effects.actuator_lag import ActuatorLag
 from envs.effects.base import Effect
 from envs.task import AbstractTask, whole_steps
+from mpc_sgft.command.errors import UserError
 from mpc_sgft.diagnose.deployment import Rollout
 from mpc_sgft.diagnose.held import MIN_LAG
 from mpc_sgft.diagnose.record import Array
-from mpc_sgft.errors import UserError
 
 
 def measured_drive(model: mujoco.MjModel, episode: Rollout) -> Array:

@@ -15,12 +15,12 @@ import mujoco
 import numpy as np
 
 from envs.effects.base import Effect, load
+from mpc_sgft.command.errors import UserError, unknown
 from mpc_sgft.diagnose.plant import Change, Plant, joint_of
 from mpc_sgft.diagnose.record import Array
 from mpc_sgft.diagnose.rows import kind_of, possible, row_of
 from mpc_sgft.diagnose.signals import SIGNALS
 from mpc_sgft.diagnose.table import INCLUDES, TABLE, Row, Scales
-from mpc_sgft.errors import UserError, unknown
 
 HIDDEN = ("velocity", "rest", "deflection", "damping_ratio")  # parameters that mean nothing while the effect is neutral
 RICHER = 0.5  # of the simpler effect's size: where a fit of what the richer one does beyond it begins

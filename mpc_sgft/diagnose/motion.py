@@ -22,9 +22,9 @@ from envs.effects.base import Effect
 from envs.effects.frame_rotation import FrameRotation
 from envs.effects.sensor_delay import SensorDelay
 from envs.task import AbstractTask, whole_steps
+from mpc_sgft.command.errors import UserError
 from mpc_sgft.diagnose.deployment import Deployment, joint_columns
 from mpc_sgft.diagnose.record import Array, Index
-from mpc_sgft.errors import UserError
 
 STATE = mujoco.mjtState.mjSTATE_FULLPHYSICS
 SUB = 5  # joints are compared so often in a control step

@@ -7,10 +7,10 @@ from collections.abc import Mapping
 import mujoco
 import numpy as np
 
+from mpc_sgft.command.errors import UserError, unknown
 from mpc_sgft.diagnose.library import Term
 from mpc_sgft.diagnose.plant import Change, Plant
 from mpc_sgft.diagnose.record import Array
-from mpc_sgft.errors import UserError, unknown
 
 QUANTITIES = ("mass", "gain", "length", "inertia", "armature", "damping")
 

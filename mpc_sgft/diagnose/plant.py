@@ -12,8 +12,8 @@ import mujoco
 import numpy as np
 
 from envs.effects.passive import stiffen_dry_friction
+from mpc_sgft.command.errors import UserError
 from mpc_sgft.diagnose.record import Array, Index
-from mpc_sgft.errors import UserError
 
 SHARP = 5e-4  # [s] longest step of a fit that is judged
 FORCE = "diagnose/force/"  # sensors that are added for the comparison

@@ -9,6 +9,7 @@ from typing import Any, Generic, TypeVar
 import mujoco
 import numpy as np
 
+from mpc_sgft.command.errors import UserError
 from mpc_sgft.diagnose.fit import Discrepancy, Fit, Problem, Residuals, by_parts, change_of, fit
 from mpc_sgft.diagnose.library import Term
 from mpc_sgft.diagnose.plant import Plant, joint_of
@@ -17,7 +18,6 @@ from mpc_sgft.diagnose.replay import Replayer
 from mpc_sgft.diagnose.smooth import noise_of, smooth
 from mpc_sgft.diagnose.table import Scales
 from mpc_sgft.diagnose.windows import AFTER, BEFORE, EITHER
-from mpc_sgft.errors import UserError
 
 WINDOW = 1.0  # [s] where the data allow it
 LEAST = 10  # samples of a window

@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mpc_sgft.errors import UserError
-from mpc_sgft.record import read_episode
+from mpc_sgft.command.errors import UserError
+from mpc_sgft.storage.episode_file import read_episode
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int_]

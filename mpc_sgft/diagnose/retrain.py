@@ -13,8 +13,8 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf, open_dict
 
+from mpc_sgft.command.errors import UserError
 from mpc_sgft.diagnose.deployment import run_config
-from mpc_sgft.errors import UserError
 
 TARGET = 0.95  # success that counts as solved
 HELD = 3  # share of retraining, one in so many, that leaves encoder and V alone
@@ -33,8 +33,8 @@ def retrain(run: Path, effects: Mapping[str, Mapping[str, Any]], out: Path, tran
     Raises:
         UserError: If the run was not finished, or a folder of an earlier retraining is in the way.
     """
-    from mpc_sgft.deploy_loop import deploy
-    from mpc_sgft.pretrain_loop import pretrain
+    from mpc_sgft.runs.deploy import deploy
+    from mpc_sgft.runs.pretrain import pretrain
 
     cfg, before = run_config(run), outcome(run)
     _finish(pretrain(pretrain_config(cfg, effects, out / "pretrain", transitions)), "pretraining")
@@ -56,7 +56,8 @@ def pretrain_config(cfg: DictConfig, effects: Mapping[str, Any], folder: Path, t
         folder: Run folder to write.
         transitions: How long.
     """
-    from mpc_sgft import build, compose
+    from mpc_sgft.command import compose
+    from mpc_sgft.runs import build
 
     task = str(cfg.chosen.task)
     made = compose.compose("pretrain", [f"task={task}"], [])

@@ -10,6 +10,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from mpc_sgft.command.errors import UserError
 from mpc_sgft.diagnose import judge, repair
 from mpc_sgft.diagnose.check import check_settings, episodes
 from mpc_sgft.diagnose.entry import Entry
@@ -28,8 +29,7 @@ from mpc_sgft.diagnose.replay import Replayer
 from mpc_sgft.diagnose.report import MAX_CANDIDATES, Report
 from mpc_sgft.diagnose.screen import key_of
 from mpc_sgft.diagnose.search import again, nearest, search
-from mpc_sgft.errors import UserError
-from mpc_sgft.log import progress as bar_of
+from mpc_sgft.storage.metrics import progress as bar_of
 
 STEPS = (4 * SHARP, 2 * SHARP, SHARP)  # [s] to simulate with: the longest whose error noise hides
 UNSEEN, NOTHING = 0.2, 0.1  # share of the expected squared error that noise hides in a search, and in a judgement

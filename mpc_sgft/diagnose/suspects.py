@@ -15,10 +15,10 @@ import numpy as np
 
 from envs.effects.base import Effect, load
 from envs.task import AbstractTask
+from mpc_sgft.command.errors import unknown
 from mpc_sgft.diagnose.library import Term, as_gap
 from mpc_sgft.diagnose.record import Array
 from mpc_sgft.diagnose.rows import kind_of
-from mpc_sgft.errors import unknown
 
 
 @dataclass(frozen=True)

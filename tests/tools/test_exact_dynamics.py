@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from mpc_sgft import build
-from mpc_sgft.compose import compose
+from mpc_sgft.command.compose import compose
+from mpc_sgft.runs import build
 from tools.exact_dynamics import ExactModel
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from omegaconf import OmegaConf
 
-from mpc_sgft.record import EpisodeWriter
+from mpc_sgft.storage.episode_file import EpisodeWriter
 from tools.export_lerobot import WRITER, main, read_run, uv_run
 
 ROOT = Path(__file__).parents[2]

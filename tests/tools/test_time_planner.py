@@ -9,7 +9,7 @@ from hydra.utils import instantiate
 from omegaconf import OmegaConf
 from torch.utils.flop_counter import FlopCounterMode
 
-from mpc_sgft.world_model import WorldModel
+from mpc_sgft.learning.world_model import WorldModel
 from planners.mppi import MPPI
 from tools import time_planner
 from tools.time_planner import ROOT, main, mlp_flop, plan_flop, random_batch, update_flop

@@ -19,7 +19,7 @@ from envs.backends.safety import Gate
 from envs.backends.stream import SAMPLE_DT
 from envs.stand_in.client import StandIn
 from envs.tasks.push import Push
-from mpc_sgft.choices import CONFIG_DIR
+from mpc_sgft.command.choices import CONFIG_DIR
 
 SLOW = {"state_age": 1.0, "detection_age": 0.4}
 

@@ -16,8 +16,9 @@ from envs.backends.base import BackendError
 from envs.backends.franka import FrankaBackend
 from envs.env import ControlEnv
 from envs.stand_in.client import StandIn
-from mpc_sgft.drive import Rollout, drive
-from mpc_sgft.record import Episode, read_episode
+from mpc_sgft.runs.real_rollout import drive
+from mpc_sgft.storage.episode_file import Episode, read_episode
+from mpc_sgft.storage.rollout import Rollout
 from planners.base import Plan
 
 AT = 3  # step that the fault comes before

@@ -9,7 +9,7 @@ from envs.backends.route import reset_route
 from envs.backends.safety import Gate, NotSafe
 from envs.kinematics import inverse, tip_position
 from envs.tasks.push import Push
-from mpc_sgft.choices import CONFIG_DIR
+from mpc_sgft.command.choices import CONFIG_DIR
 
 
 def test_every_way_to_the_start_is_allowed(robot_push: Push, robot_config: dict) -> None:

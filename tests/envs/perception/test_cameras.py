@@ -8,7 +8,7 @@ from hydra.utils import instantiate
 
 from envs.perception.base import Detection, PerceptionError
 from envs.perception.cameras import fuse
-from mpc_sgft.errors import UserError, from_config
+from mpc_sgft.command.errors import UserError, from_config
 
 CONFIGS = Path(__file__).resolve().parents[3] / "configs/perception"
 

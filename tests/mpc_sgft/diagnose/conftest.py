@@ -13,7 +13,7 @@ from envs.backends.sim import SimBackend
 from envs.effects import load
 from envs.tasks.push import Push
 from mpc_sgft.diagnose.record import write_csv
-from mpc_sgft.record import EpisodeWriter
+from mpc_sgft.storage.episode_file import EpisodeWriter
 
 SLIDE = """<mujoco><option timestep="0.002"/><worldbody><body name="cart">
 <joint name="x" type="slide" axis="1 0 0"/><geom size="0.1" mass="5"/></body></worldbody>

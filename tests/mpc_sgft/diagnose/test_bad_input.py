@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from mpc_sgft.command.errors import UserError
 from mpc_sgft.diagnose.__main__ import main
 from mpc_sgft.diagnose.check import episodes
 from mpc_sgft.diagnose.plant import Axis, load_plant
 from mpc_sgft.diagnose.record import Table, files, read_table, write_csv
-from mpc_sgft.errors import UserError
 
 CHIRP = np.sin(1e-3 * np.arange(209) ** 2)
 RANGES = {"x": Axis(-2.0, 2.0, slide=True)}
@@ -171,7 +171,7 @@ def test_broken_parquet_and_mcap(tmp_path: Path) -> None:
 
 
 def test_a_truncated_mcap_is_read_as_far_as_it_is_whole(tmp_path: Path) -> None:
-    from mpc_sgft.record import EpisodeWriter
+    from mpc_sgft.storage.episode_file import EpisodeWriter
 
     path = tmp_path / "a.mcap"
     with EpisodeWriter(path, {"joint_names": ["x"], "actuator_names": ["motor"]}) as writer:

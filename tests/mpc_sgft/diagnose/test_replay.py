@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from mpc_sgft.command.errors import UserError
 from mpc_sgft.diagnose.held import held_mean
 from mpc_sgft.diagnose.library import candidates, enrich, make_term
 from mpc_sgft.diagnose.plant import Change, Plant
@@ -18,7 +19,6 @@ from mpc_sgft.diagnose.rub import Drive
 from mpc_sgft.diagnose.smooth import smooth
 from mpc_sgft.diagnose.table import TABLE, Scales
 from mpc_sgft.diagnose.windows import AFTER, BEFORE
-from mpc_sgft.errors import UserError
 
 SLIDE = """<mujoco><option timestep="0.002"/><worldbody><body name="cart"><joint name="x" type="slide" axis="1 0 0"/>
 <geom size="0.1" mass="2"/></body></worldbody><actuator><motor name="motor" joint="x"/></actuator></mujoco>"""

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from mpc_sgft.command.errors import UserError
 from mpc_sgft.diagnose.plant import Axis
 from mpc_sgft.diagnose.record import Table
 from mpc_sgft.diagnose.units import check_order, check_speeds, check_units
-from mpc_sgft.errors import UserError
 
 T = np.arange(1000) * 0.004
 ARM = {"elbow": Axis(-2.9, 2.9)}

@@ -1,0 +1,1 @@
+"""The world model, its objectives, replay, and the machinery that every method shares."""

@@ -1,0 +1,388 @@
+"""World model + optimisers: update() in pretraining, update_transfer() on real data."""
+
+import copy
+import hashlib
+from collections.abc import Mapping
+from typing import Any, cast
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
+
+from mpc_sgft.learning import losses
+from mpc_sgft.learning.slices import check_finite, to_slices
+from mpc_sgft.learning.world_model import WorldModel
+
+METHODS = {  # the parts that train at transfer
+    "sgft": ("dynamics", "policy_head"),
+    "tdmpc2": ("encoder", "dynamics", "reward_head", "q_ensemble", "value_head", "policy_head", "decoder"),
+    "zero_shot": (),
+}
+PRETRAINED = METHODS["tdmpc2"]
+
+
+class Agent:
+    """Trains a world model; the numbers are explained in configs/train/default.yaml.
+
+    Args:
+        model: Trained in place.
+        seed: Of the noise in the updates.
+        device: Where model and batches live.
+        others: configs/train/default.yaml, group `agent`.
+    """
+
+    def __init__(
+        self,
+        model: WorldModel,
+        *,
+        seed: int = 0,
+        device: torch.device | str = "cpu",
+        discount: float,
+        rho: float,
+        lr: float,
+        encoder_lr_share: float,
+        grad_clip: float,
+        consistency_weight: float,
+        reward_weight: float,
+        q_weight: float,
+        value_weight: float,
+        decoder_weight: float,
+        target_rate: float,
+        average_decay: float,
+        scale_rate: float,
+        entropy_coef: float,
+        entropy_lr: float,
+        transfer_lr: float,
+        transfer_policy_lr: float,
+        transfer_entropy_coef: float,
+        anchor: float,
+        residual: bool,
+        command_map: bool,
+        command_lr: float,
+    ) -> None:
+        if not 0 <= discount <= 1 or not 0 < rho <= 1:
+            raise ValueError(f"discount must lie in [0, 1] and rho in (0, 1], got discount={discount}, rho={rho}.")
+        self.device = torch.device(device)
+        self.model = model.to(self.device).train()
+        self.discount, self.rho, self.grad_clip, self.target_rate = discount, rho, grad_clip, target_rate
+        self.lr, self.encoder_lr_share, self.entropy_lr = lr, encoder_lr_share, entropy_lr
+        self.weights = {
+            "consistency_loss": consistency_weight,
+            "reward_loss": reward_weight,
+            "q_loss": q_weight,
+            "value_loss": value_weight,
+            "decoder_loss": decoder_weight,
+        }
+        self.transfer_lr, self.transfer_policy_lr = transfer_lr, transfer_policy_lr
+        self.transfer_entropy_coef, self.anchor, self.residual = transfer_entropy_coef, anchor, residual
+        self.command_map, self.command_lr = command_map, command_lr
+        self.generator = torch.Generator(self.device).manual_seed(seed)
+        self.scale = losses.RunningScale(scale_rate, self.device)
+        self.log_entropy_coef = torch.tensor(entropy_coef, device=self.device).log().requires_grad_()
+        self._averaged = AveragedModel(self.model, multi_avg_fn=get_ema_multi_avg_fn(average_decay))
+        self.method: str | None = None  # None while pretraining
+        self.horizon = 0  # imagined steps of the policy's objective; 0 in pretraining: it climbs the critics
+        self.trainable: tuple[str, ...] = (*PRETRAINED, "normalizer", "target_q")
+        self._anchored: list[Tensor] = []
+        self._make_optimizers(lr, lr)
+
+    @property
+    def averaged(self) -> WorldModel:
+        """The model with its weights averaged over the last updates of pretraining: what is evaluated and saved."""
+        return cast(WorldModel, self._averaged.module)
+
+    def scale_learning_rates(self, share: float) -> None:
+        """Set the pretraining learning rates to a share of the configured ones."""
+        for optimizer in (self.model_optimizer, self.policy_optimizer):
+            for group in optimizer.param_groups:
+                group["lr"] = share * group.setdefault("full_lr", group["lr"])
+
+    def hold_value(self, held: bool) -> None:
+        """Whether encoder and V stay as they are while everything else learns in simulation."""
+        for part in ("encoder", "value_head"):
+            getattr(self.model, part).requires_grad_(not held)
+
+    # -- learning in simulation ----------------------------------------------------------------------------------------
+
+    def update(self, batch: TensorDictBase) -> dict[str, float]:
+        """One step of the TD-MPC2 objective with a value head, on slices [B, T]; returns metrics.
+
+        Raises:
+            FloatingPointError: If an entry of the batch or a loss is not finite; no parameter has been changed then.
+        """
+        model, data = self.model, to_slices(batch, self.device)
+        if self.method is None:
+            model.normalizer.update(data.observation[0])
+        first_z = model.encode(data.observation[0])  # [B, D], trains the encoder
+        with torch.no_grad():
+            encoded = torch.cat([first_z.unsqueeze(0), model.encode(data.observation[1:])])  # [T + 1, B, D]
+            ended = torch.cat([torch.zeros_like(data.terminated[:1]), data.terminated])  # [T + 1, B]
+            action, _ = model.policy(encoded, self._noise(*encoded.shape[:-1]))
+            if model.num_q == 2:
+                target_q = pair = model.q(encoded, action, target=True)  # [E, T + 1, B]
+            else:
+                target_q = model.q(encoded, action, target=True)
+                pair = target_q[self._two_heads()]
+            q_target = model.two_hot.encode(
+                losses.td_target(data.reward, data.terminated, pair[:, 1:], self.discount)
+            )  # [T, B, bins]
+            v_target = model.two_hot.encode(losses.value_target(target_q, ended))
+            r_target = model.two_hot.encode(data.reward)
+
+        zs = self._imagine(first_z, data.action)  # [T + 1, B, D]
+        q_logits = model.q_logits(zs[:-1], data.action)  # [E, T, B, bins]
+        per_step = {
+            "consistency_loss": losses.consistency_loss(zs[1:], encoded[1:]),
+            "reward_loss": losses.two_hot_loss(model.reward_logits(zs[:-1], data.action, zs[1:]), r_target),
+            "q_loss": losses.two_hot_loss(q_logits, q_target.expand_as(q_logits)).mean(0),
+            "value_loss": losses.two_hot_loss(model.value_head(zs.detach()), v_target),
+            "decoder_loss": self._decoder_loss(encoded, data.observation),
+        }
+        metrics = {name: losses.over_time(loss, self.rho) for name, loss in per_step.items()}
+        total = torch.stack([self.weights[name] * loss for name, loss in metrics.items()]).sum()
+        check_finite(metrics)
+        metrics["loss"] = total
+        self.model_optimizer.zero_grad()
+        total.backward()
+        metrics["grad_norm"] = torch.nn.utils.clip_grad_norm_(self._model_parameters, self.grad_clip, foreach=True)
+        self.model_optimizer.step()
+
+        imagine = self.method is None and self.horizon > 0
+        metrics |= self._update_policy_imagined(encoded[0]) if imagine else self._update_policy(zs.detach())
+        model.update_targets(self.target_rate)
+        if self.method is None:
+            self._averaged.update_parameters(model)
+        metrics["target_value"] = target_q.mean()
+        return _floats(metrics)
+
+    def _update_policy(self, zs: Tensor) -> dict[str, Tensor]:
+        action, log_prob = self.model.policy(zs, self._noise(*zs.shape[:-1]))
+        heads = None if self.model.num_q == 2 else self._two_heads()
+        q = self.model.q(zs, action, heads=heads)  # [2, T + 1, B]
+        scale = self.scale.update(q.detach()[:, 0])
+        coef = self.log_entropy_coef.detach().exp()
+        loss = losses.over_time(losses.policy_loss(q, log_prob, coef, scale), self.rho)
+        return self._step_policy(loss, log_prob) | {"entropy_coef": coef, "scale": scale}
+
+    def _update_policy_imagined(self, starts: Tensor) -> dict[str, Tensor]:
+        coef = self.log_entropy_coef.detach().exp()
+        return self._climb(starts, coef) | {"entropy_coef": coef}
+
+    def _climb(self, starts: Tensor, coef: Tensor | float) -> dict[str, Tensor]:
+        """A step of the policy up the SGFT objective of imagined steps from latents [B, D]."""
+        noise = self._noise(self.horizon, len(starts))
+        objective, log_prob = losses.imagined_objective(self.model, starts, noise, self.discount)
+        scale = self.scale.update(objective.detach())
+        metrics = self._step_policy(coef * log_prob.mean() - objective.mean() / scale, log_prob)
+        return metrics | {"objective": objective.mean(), "scale": scale}
+
+    def _step_policy(self, loss: Tensor, log_prob: Tensor) -> dict[str, Tensor]:
+        check_finite({"policy_loss": loss})
+        parameters = list(self.model.policy_head.parameters())
+        self.policy_optimizer.zero_grad()
+        loss.backward(inputs=parameters)  # the critics and the dynamics collect no gradient here
+        torch.nn.utils.clip_grad_norm_(parameters, self.grad_clip, foreach=True)
+        self.policy_optimizer.step()
+        if self.entropy_lr and self.method != "sgft":
+            self.entropy_optimizer.zero_grad()
+            losses.entropy_coef_loss(self.log_entropy_coef, log_prob, -float(self.model.action_dim)).backward()
+            self.entropy_optimizer.step()
+        return {"policy_loss": loss, "entropy": -log_prob.mean()}
+
+    # -- learning on real data -----------------------------------------------------------------------------------------
+
+    def freeze_for_transfer(
+        self,
+        method: str,
+        *,
+        horizon: int = 4,
+        anchor: float | None = None,
+        residual: bool | None = None,
+        command_map: bool | None = None,
+        rho: float | None = None,
+    ) -> None:
+        """Freeze everything but what `method` trains, and start fresh optimisers.
+
+        Args:
+            method: sgft | tdmpc2 | zero_shot.
+            horizon: Imagined steps of the policy's SGFT objective [H].
+            anchor: Weight of the squared distance of the dynamics' parameters from the pretrained ones beside their
+                consistency loss; None: as configured.
+            residual: Train a correction on top of frozen pretrained dynamics; None: as configured.
+            command_map: Also learn what the machine makes of a command, a few numbers that hold everywhere; None: as
+                configured.
+            rho: Decay of the dynamics loss per imagined step; None: as configured.
+
+        Raises:
+            ValueError: If the method is unknown or the horizon is not positive.
+        """
+        if method not in METHODS:
+            raise ValueError(f"No transfer method {method!r}. Available: {', '.join(METHODS)}.")
+        if horizon < 1:
+            raise ValueError(f"horizon={horizon} must be at least one control step.")
+        self.method, self.horizon = method, horizon
+        self.anchor = self.anchor if anchor is None else anchor
+        self.residual = self.residual if residual is None else residual
+        self.command_map = self.command_map if command_map is None else command_map
+        self.rho = self.rho if rho is None else rho
+        self.trainable = (*METHODS[method], "target_q") if method == "tdmpc2" else METHODS[method]
+        model = self.model
+        model.requires_grad_(False)
+        for part in METHODS[method]:
+            getattr(model, part).requires_grad_(True)
+        if self.residual and method == "sgft":
+            if model.dynamics.residual is None:
+                model.add_residual()
+            model.dynamics.base.requires_grad_(False)
+            self.trainable = ("dynamics.residual", "policy_head")
+        if self.command_map and method == "sgft":
+            if model.dynamics.command is None:
+                model.add_command_map()
+            self.trainable += ("dynamics.command",)
+        trained = [p for part in (model.dynamics.base, model.dynamics.residual) if part for p in part.parameters()]
+        self._anchored = [p.detach().clone() for p in trained if p.requires_grad]
+        if method == "tdmpc2":
+            self._make_optimizers(self.lr, self.lr)
+        elif method == "sgft":
+            self._make_optimizers(self.transfer_lr, self.transfer_policy_lr)
+
+    def update_transfer(self, batch: TensorDictBase, weight: Tensor | None = None) -> dict[str, float]:
+        """One step on slices [B, T] of any mixture of real and simulated data; returns metrics.
+
+        Args:
+            batch: As from the buffer.
+            weight: Of each slice in the dynamics loss, [B], mean one; None weighs all alike. Only with method sgft.
+
+        Raises:
+            ValueError: If nothing trains (method zero_shot, or freeze_for_transfer was not called).
+            FloatingPointError: If an entry of the batch or a loss is not finite; that loss has changed nothing then.
+        """
+        if self.method == "tdmpc2":
+            return self.update(batch)
+        if self.method != "sgft":
+            raise ValueError(
+                f"update_transfer needs freeze_for_transfer('sgft') or ('tdmpc2') first; method is {self.method!r}."
+            )
+        data = to_slices(batch, self.device)
+        with torch.no_grad():
+            encoded = self.model.encode(data.observation)  # [T + 1, B, D]
+        zs = self._imagine(encoded[0], data.action)
+        loss = losses.over_time(losses.consistency_loss(zs[1:], encoded[1:]), self.rho, weight)
+        metrics = {"consistency_loss": loss}
+        if self.anchor:
+            moved = zip(self._model_parameters[-len(self._anchored) :], self._anchored, strict=True)
+            metrics["anchor_distance"] = torch.stack([(now - then).square().sum() for now, then in moved]).sum()
+            loss = loss + self.anchor * metrics["anchor_distance"]
+        check_finite(metrics)
+        self.model_optimizer.zero_grad()
+        (self.weights["consistency_loss"] * loss).backward()
+        metrics["grad_norm"] = torch.nn.utils.clip_grad_norm_(self._model_parameters, self.grad_clip, foreach=True)
+        self.model_optimizer.step()
+
+        return _floats(metrics | self._climb(encoded[0], self.transfer_entropy_coef))
+
+    @torch.no_grad()
+    def model_error(self, batch: TensorDictBase) -> Tensor:
+        """Squared latent error of the dynamics after 1..T open-loop steps, mean over the latent, [B, T]."""
+        data = to_slices(batch, self.device)
+        encoded = self.model.encode(data.observation)
+        zs = self._imagine(encoded[0], data.action)
+        return losses.consistency_loss(zs[1:], encoded[1:]).transpose(0, 1)
+
+    # -- state ---------------------------------------------------------------------------------------------------------
+
+    def snapshot(self) -> dict[str, Any]:
+        """Copy of what trains: parameters and optimisers. Give it to `restore` to undo updates."""
+        state = {name: x.detach().clone() for name, x in self.model.state_dict().items() if self._trains(name)}
+        optimizers = {name: copy.deepcopy(o.state_dict()) for name, o in self._optimizers().items()}
+        rest = {"log_entropy_coef": self.log_entropy_coef.detach().clone(), "scale": self.scale.value.clone()}
+        return {"model": state, "optimizers": optimizers, **rest}
+
+    @torch.no_grad()
+    def restore(self, snapshot: Mapping[str, Any]) -> None:
+        """Undo every update since `snapshot` was taken; the noise generator goes on."""
+        self.model.load_state_dict(snapshot["model"], strict=False)
+        for name, optimizer in self._optimizers().items():
+            optimizer.load_state_dict(copy.deepcopy(snapshot["optimizers"][name]))
+        self.log_entropy_coef.copy_(snapshot["log_entropy_coef"])
+        self.scale.value = snapshot["scale"].clone()
+
+    def frozen_hash(self) -> str:
+        """SHA-256 of the names and bytes of every tensor of the model that does not train, in hexadecimal."""
+        digest = hashlib.sha256()
+        for name, x in sorted(self.model.state_dict().items()):
+            if not self._trains(name):
+                digest.update(name.encode())
+                digest.update(x.detach().cpu().contiguous().numpy().tobytes())
+        return digest.hexdigest()
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything needed to go on with the same numbers; the torch global generator (dropout) is included."""
+        names = ("method", "horizon", "anchor", "residual", "command_map", "rho")
+        transfer = {name: getattr(self, name) for name in names}
+        return {
+            "transfer": transfer,
+            "anchored": [x.clone() for x in self._anchored],
+            "model": {name: x.detach().clone() for name, x in self.model.state_dict().items()},
+            "averaged": self._averaged.state_dict() if self.method is None else None,
+            "snapshot": self.snapshot(),
+            "generator": self.generator.get_state(),
+            "torch_rng": torch.get_rng_state(),
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on from `state_dict` of an agent of the same sizes and numbers."""
+        if state["transfer"]["method"] is not None:
+            self.freeze_for_transfer(**state["transfer"])
+        self.model.load_state_dict(state["model"])
+        if state["averaged"] is not None:
+            self._averaged.load_state_dict(state["averaged"])
+        self._anchored = [x.to(self.device) for x in state["anchored"]]
+        self.restore(state["snapshot"])
+        self.generator.set_state(state["generator"].cpu())
+        torch.set_rng_state(state["torch_rng"].cpu())
+
+    # -- helpers -------------------------------------------------------------------------------------------------------
+
+    def _make_optimizers(self, lr: float, policy_lr: float) -> None:
+        model = self.model
+        command = [] if model.dynamics.command is None else [*model.dynamics.command.parameters()]
+        groups = [{"params": command, "lr": self.command_lr}] if command else []
+        for part in PRETRAINED:
+            parameters = [p for p in getattr(model, part).parameters() if p.requires_grad and part != "policy_head"]
+            parameters = [p for p in parameters if all(p is not c for c in command)]
+            if parameters:
+                share = self.encoder_lr_share if part == "encoder" else 1.0
+                groups.append({"params": parameters, "lr": lr * share})
+        self._model_parameters = [p for group in groups for p in group["params"]]
+        self.model_optimizer = torch.optim.Adam(groups, fused=True)
+        self.policy_optimizer = torch.optim.Adam(model.policy_head.parameters(), lr=policy_lr, eps=1e-5, fused=True)
+        self.entropy_optimizer = torch.optim.Adam([self.log_entropy_coef], lr=self.entropy_lr)
+
+    def _optimizers(self) -> dict[str, torch.optim.Adam]:
+        return {"model": self.model_optimizer, "policy": self.policy_optimizer, "entropy": self.entropy_optimizer}
+
+    def _trains(self, name: str) -> bool:
+        return any(name.startswith(part + ".") for part in self.trainable)
+
+    def _imagine(self, z: Tensor, actions: Tensor) -> Tensor:
+        zs = [z]
+        for action in actions:
+            zs.append(self.model.next(zs[-1], action))
+        return torch.stack(zs)
+
+    def _decoder_loss(self, z: Tensor, observation: Tensor) -> Tensor:
+        wanted = self.model.normalizer(observation)[..., : self.model.sizes["decode_dim"]]
+        return (self.model.decoder(z.detach()) - wanted).square().mean(-1)
+
+    def _noise(self, *shape: int) -> Tensor:
+        return torch.randn(*shape, self.model.action_dim, generator=self.generator, device=self.device)
+
+    def _two_heads(self) -> list[int]:
+        return torch.randperm(self.model.num_q, generator=self.generator, device=self.device)[:2].tolist()
+
+
+def _floats(metrics: Mapping[str, Tensor]) -> dict[str, float]:
+    values = torch.stack([m.detach().float() for m in metrics.values()]).tolist()
+    return dict(zip(metrics, values, strict=True))

@@ -1,0 +1,32 @@
+"""The improvability audit on real data: can SGFT work here, and where can it not?"""
+
+import csv
+from pathlib import Path
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from mpc_sgft.learning.shaping import Audit, improvable
+from mpc_sgft.learning.world_model import WorldModel
+
+
+def audit(model: WorldModel, steps: TensorDict, discount: float, *, seed: int) -> Audit:
+    """Definition 1 at the states that a rollout [T] arrived in, under the model's dynamics; margins are [T]."""
+    device = next(model.parameters()).device
+    with torch.inference_mode():
+        z = model.encode(steps["next", "observation"].to(device))
+    reward = steps["next", "reward"][:, 0].to(device)
+    generator = torch.Generator(device).manual_seed(seed)
+    return improvable(model, z, reward, action_dim=model.action_dim, discount=discount, generator=generator)
+
+
+def write_audit(path: Path, rollout: int, steps: TensorDict, margin: Tensor, names: tuple[str, ...]) -> None:
+    """Append a row for each state: which rollout and step, what was observed, the margin (negative: not improvable)."""
+    fresh = not path.exists()
+    with path.open("a", newline="") as file:
+        writer = csv.writer(file)
+        if fresh:
+            writer.writerow(["rollout", "step", *names, "margin"])
+        for t, (observation, value) in enumerate(zip(steps["next", "observation"], margin.cpu(), strict=True)):
+            writer.writerow([rollout, t + 1, *(f"{x:.4f}" for x in observation[: len(names)].tolist()), f"{value:.4f}"])

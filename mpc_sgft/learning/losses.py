@@ -1,0 +1,113 @@
+"""Objectives of the world model: tensors in, tensors out, no state but RunningScale.
+
+Shapes are time first: [T, B, ...], T steps of a slice, B slices. A loss per step and slice becomes a scalar through
+`over_time`.
+
+Source: TD-MPC2, arXiv:2310.16828; entropy coefficient: SAC, arXiv:1812.05905; transfer objective: SGFT (Yin et al.,
+ICLR 2025).
+"""
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from mpc_sgft.learning.world_model import WorldModel
+
+
+def over_time(loss: Tensor, rho: float, weight: Tensor | None = None) -> Tensor:
+    """Scalar (1/T) sum_t rho^t mean_b weight_b loss_tb.
+
+    Args:
+        loss: [T, B].
+        rho: Decay per imagined step, in (0, 1]; later steps carry the errors of earlier ones.
+        weight: Per slice, [B], mean one; None weighs all alike.
+    """
+    steps = torch.arange(loss.shape[0], dtype=loss.dtype, device=loss.device)
+    mean = (loss if weight is None else loss * weight).mean(1)  # [T]
+    return (rho**steps * mean).mean()
+
+
+def consistency_loss(imagined: Tensor, encoded: Tensor) -> Tensor:
+    """Mean squared error over the latent, [T, B, D] -> [T, B]. `encoded` is a constant."""
+    return (imagined - encoded.detach()).square().mean(-1)
+
+
+def two_hot_loss(logits: Tensor, target: Tensor) -> Tensor:
+    """Cross-entropy toward two-hot probabilities, both [..., num_bins] -> [...]."""
+    bins = logits.shape[-1]
+    loss = F.cross_entropy(logits.reshape(-1, bins), target.reshape(-1, bins), reduction="none")
+    return loss.reshape(logits.shape[:-1])
+
+
+def td_target(reward: Tensor, terminated: Tensor, next_q: Tensor, discount: float) -> Tensor:
+    """y = r + gamma (1 - terminated) min_e Q_e(z', pi(z')); a truncated step bootstraps, a terminated one does not.
+
+    Args:
+        reward: [T, B].
+        terminated: Bool, [T, B].
+        next_q: Two target critics at the next latent and the policy's action, [2, T, B].
+    """
+    return reward + discount * torch.where(terminated, 0.0, next_q.amin(0))
+
+
+def value_target(q: Tensor, terminated: Tensor) -> Tensor:
+    """Target of V(z): the mean of the target critics at (z, pi(z)), zero where the episode has terminated.
+
+    Args:
+        q: [E, T, B].
+        terminated: Bool, [T, B]: the latent belongs to a terminal state, whose value is zero by definition.
+    """
+    return torch.where(terminated, 0.0, q.mean(0))
+
+
+def policy_loss(q: Tensor, log_prob: Tensor, entropy_coef: Tensor | float, scale: Tensor | float) -> Tensor:
+    """alpha log pi(a|z) - mean_e Q_e(z, a) / scale, [E, T, B] and [T, B] -> [T, B]."""
+    return entropy_coef * log_prob - q.mean(0) / scale
+
+
+def entropy_coef_loss(log_coef: Tensor, log_prob: Tensor, target_entropy: float) -> Tensor:
+    """-log alpha mean(log pi + target): alpha grows while the policy's entropy is below its target. Scalar."""
+    return -log_coef * (log_prob.detach().mean() + target_entropy)
+
+
+def imagined_objective(model: WorldModel, z: Tensor, noise: Tensor, discount: float) -> tuple[Tensor, Tensor]:
+    """SGFT objective of the policy's own imagined actions, differentiable in the policy through the dynamics.
+
+        J = sum_{t<H} gamma^t r_t + gamma^H V(z_H) - V(z_0),   a_t = pi(z_t)
+
+    Args:
+        z: Latents to start from, [M, D].
+        noise: Standard normal, [H, M, A].
+
+    Returns:
+        Objective [M], and mean log-density of the actions taken [M].
+    """
+    objective, log_probs, weight = -model.terminal_value(z), [], 1.0
+    for step_noise in noise:
+        action, log_prob = model.policy(z, step_noise)
+        next_z = model.next(z, action)
+        objective = objective + weight * model.reward(z, action, next_z)
+        log_probs.append(log_prob)
+        z, weight = next_z, weight * discount
+    return objective + weight * model.terminal_value(z), torch.stack(log_probs).mean(0)
+
+
+class RunningScale:
+    """Running 5-95 % range of values, at least one: keeps the policy loss alike across reward scales.
+
+    Source: DreamerV3, arXiv:2301.04104; TD-MPC2's `RunningScale`.
+
+    Args:
+        rate: Share of the newest batch's range.
+    """
+
+    def __init__(self, rate: float, device: torch.device | str = "cpu") -> None:
+        self.rate = rate
+        self.value = torch.ones((), device=device)
+
+    @torch.no_grad()
+    def update(self, x: Tensor) -> Tensor:
+        """Take in a batch of any shape; returns the range, a scalar tensor."""
+        low, high = torch.quantile(x.flatten(), torch.tensor([0.05, 0.95], device=x.device))
+        self.value = torch.lerp(self.value, (high - low).clamp_min(1.0), self.rate)
+        return self.value

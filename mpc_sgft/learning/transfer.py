@@ -1,0 +1,135 @@
+"""Learning from few real rollouts without losing what the simulator taught.
+
+The dynamics and the policy that act are not simply the ones that train. A model fine-tuned on two hundred
+transitions of five rollouts has forgotten what it knew elsewhere, and where zero-shot already worked that does harm. So
+each new rollout is first a test: it has not been trained on, and the pretrained and the fine-tuned dynamics both
+predict it. The fine-tuned parts act once they have predicted such rollouts clearly better; until then the pretrained
+do.
+"""
+
+import copy
+import math
+from collections.abc import Callable, Iterable
+from functools import partial
+from typing import NamedTuple
+
+import torch
+from tensordict import TensorDict
+
+from mpc_sgft.learning.agent import Agent
+from mpc_sgft.learning.buffer import make_buffer
+from mpc_sgft.learning.world_model import WorldModel
+
+
+class Verdict(NamedTuple):
+    """How the dynamics predicted a rollout that nobody had trained on."""
+
+    pretrained: float  # latent error over the horizon, mean over steps
+    fine_tuned: float
+    accepted: bool  # the fine-tuned parts act in the next rollout
+
+
+class Transfer:
+    """The agent that trains, the model that acts, and the gate between them.
+
+    Args:
+        agent: Pretrained agent, already frozen for transfer.
+        capacity: Real transitions to hold.
+        slice_len, batch_size, seed: Of the replay slices.
+        updates: Gradient steps after each rollout.
+        gate: Whether fine-tuned parts must first predict unseen rollouts better; without, they act at once.
+        margin: They must lower the error to this share of the pretrained error, in the geometric mean over the last
+            `memory` rollouts: one odd rollout shuts nothing.
+        memory: Rollouts that the gate looks back on.
+    """
+
+    def __init__(
+        self,
+        agent: Agent,
+        *,
+        capacity: int,
+        slice_len: int,
+        batch_size: int,
+        seed: int,
+        updates: int,
+        gate: bool,
+        margin: float,
+        memory: int,
+    ):
+        self.agent, self.updates, self.gate, self.margin, self.memory = agent, updates, gate, margin, memory
+        self.slice_len, self.anchor = slice_len, agent.anchor
+        self._new_buffer = partial(
+            make_buffer, capacity=capacity, slice_len=slice_len, batch_size=batch_size, seed=seed
+        )
+        self.buffer = self._new_buffer()
+        self.pretrained = copy.deepcopy(agent.model)
+        self.acting: WorldModel = copy.deepcopy(agent.model)
+        self.verdicts: list[Verdict] = []
+
+    def judge(self, steps: TensorDict) -> Verdict:
+        """Test both dynamics on a rollout [T] before it is learned from, and decide who acts next."""
+        pretrained, fine_tuned = (
+            float(open_loop_error(model, steps, self.slice_len).nanmean())
+            for model in (self.pretrained, self.agent.model)
+        )
+        self.verdicts.append(Verdict(pretrained, fine_tuned, not self.gate))
+        recent = self.verdicts[1:][-self.memory :]  # at the first rollout the two are still the same
+        if self.gate and recent:
+            self.verdicts[-1] = self.verdicts[-1]._replace(accepted=clearly_better(recent, self.margin))
+        return self.verdicts[-1]
+
+    def learn(self, steps: TensorDict, track: Callable[[range], Iterable[int]] = iter) -> dict[str, float]:
+        """Judge a rollout [T], learn from all there are, and hand over the parts that may act; returns metrics.
+
+        Args:
+            steps: The rollout.
+            track: Shows how far the gradient steps are, as tqdm does.
+        """
+        verdict = self.judge(steps)
+        self.buffer.extend(steps)
+        self.agent.anchor = self.anchor / len(self.verdicts)  # a prior weighs less, the more data there are
+        metrics: dict[str, float] = {}
+        for _ in track(range(self.updates)):
+            metrics = self.agent.update_transfer(self.buffer.sample())
+        self.acting.load_state_dict((self.agent.model if verdict.accepted else self.pretrained).state_dict())
+        return metrics | {"error_pretrained": verdict.pretrained, "error_fine_tuned": verdict.fine_tuned}
+
+    def state_dict(self) -> dict:
+        return {
+            "agent": self.agent.state_dict(),
+            "buffer": self.buffer.state_dict(),
+            "acting": self.acting.state_dict(),
+            "verdicts": [tuple(v) for v in self.verdicts],
+        }
+
+    def load_state_dict(self, state: dict) -> None:
+        self.agent.load_state_dict(state["agent"])
+        self.buffer = self._new_buffer()  # what is loaded may hold less than what is there
+        self.buffer.load_state_dict(state["buffer"])
+        self.acting.load_state_dict(state["acting"])
+        self.verdicts = [Verdict(*v) for v in state["verdicts"]]
+
+
+def clearly_better(verdicts: list[Verdict], margin: float) -> bool:
+    """Whether fine-tuning lowered the geometric mean of the errors to less than `margin` of the pretrained one."""
+    return math.prod(v.fine_tuned for v in verdicts) < math.prod(margin * v.pretrained for v in verdicts)
+
+
+@torch.inference_mode()
+def open_loop_error(model: WorldModel, steps: TensorDict, horizon: int) -> torch.Tensor:
+    """Squared latent error of imagining the taken actions, [T, H]; nan where the episode ended before.
+
+    Args:
+        model: Whose dynamics.
+        steps: One episode, [T].
+        horizon: H, steps imagined from each step.
+    """
+    device = next(model.parameters()).device
+    action = steps["action"].to(device)
+    target = model.encode(steps["next", "observation"].to(device))
+    z, count = model.encode(steps["observation"].to(device)), len(steps)
+    error = torch.full((count, horizon), torch.nan, device=device)
+    for h in range(min(horizon, count)):
+        z = model.next(z[: count - h], action[h:])
+        error[: count - h, h] = (z - target[h:]).square().mean(-1)
+    return error.cpu()

@@ -1,0 +1,252 @@
+"""The TD-MPC2 world model with one addition, a state-value head. Satisfies `planners.base.Model` by having its methods.
+
+    z = encode(o)    z' = next(z, a)    r = reward(z, a, z')    V(z)    Q_e(z, a)    a = policy(z)    o = decode(z)
+
+Source: TD-MPC2, arXiv:2310.16828. V(z) is ours: the potential and terminal value of SGFT (Yin et al., ICLR 2025) must
+be one frozen, deterministic function of the latent; Q(z, pi(z)) would move with the policy that keeps training.
+"""
+
+import copy
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from mpc_sgft.learning.layers import Ensemble, Normalizer, SimNorm, TwoHot, by_blocks, gaussian_tanh, mlp, simnorm
+
+PARTS = (
+    "normalizer",
+    "encoder",
+    "dynamics",
+    "reward_head",
+    "q_ensemble",
+    "target_q",
+    "value_head",
+    "policy_head",
+    "decoder",
+)
+REWARD_FROM = ("next", "current")
+LOG_STD_MIN, LOG_STD_MAX = -10.0, 2.0
+
+
+class Dynamics(nn.Module):
+    """Latent dynamics. A latent z = [s, m] is a code s [D] and the last commands m, newest first [M].
+
+        c_i = sum_j W_j u_{i+j} + b for each command u_i of u = [a, m]   what the machine makes of its commands
+        s'  = SimNorm(f(s, c) [+ residual(s, c)])
+        m'  = [a, m without its last command]                            exact, so only s' is learned
+
+    Until `add_command_map` c is u. From then on W and b are learned, from the identity on: a gain, a rotation, a drift,
+    a delay, a lag, a few numbers that hold wherever the robot is. Commands older than the memory count as its oldest.
+    `add_residual` adds a correction that starts at zero.
+    """
+
+    def __init__(self, code_dim: int, memory_dim: int, action_dim: int, mlp_dim: int, simnorm_dim: int) -> None:
+        super().__init__()
+        inputs = code_dim + memory_dim + action_dim
+        self.base = mlp([inputs, mlp_dim, mlp_dim, code_dim], out=nn.Identity())  # ends in LayerNorm
+        self.residual: nn.Module | None = None
+        self.command: nn.Linear | None = None
+        self.code_dim, self.memory_dim, self.simnorm_dim = code_dim, memory_dim, simnorm_dim
+
+    def forward(self, z: Tensor, action: Tensor) -> Tensor:
+        commands = torch.cat([action, z[..., self.code_dim :]], -1)  # newest first [..., A + M]
+        x = torch.cat([z[..., : self.code_dim], self.realised(commands)], -1)  # [..., D + A + M]
+        logits = self.base(x)
+        code = simnorm(logits if self.residual is None else logits + self.residual(x), self.simnorm_dim)
+        return torch.cat([code, commands[..., : self.memory_dim]], -1) if self.memory_dim else code
+
+    def realised(self, commands: Tensor) -> Tensor:
+        """What the machine makes of commands, newest first, [..., K A] -> [..., K A]."""
+        if self.command is None:
+            return commands
+        each = commands.unflatten(-1, (-1, self.command.out_features))  # [..., K, A]
+        lag = torch.arange(each.shape[-2], device=commands.device)
+        longest = self.command.in_features // self.command.out_features
+        window = (lag[:, None] + torch.arange(longest, device=commands.device)).clamp(max=len(lag) - 1)
+        return self.command(each[..., window, :].flatten(-2)).flatten(-2)
+
+    def as_simulated(self, z: Tensor) -> Tensor:
+        """The latent with its commands as the machine realised them: what the simulator would have called them."""
+        if self.command is None or not self.memory_dim:
+            return z
+        return torch.cat([z[..., : self.code_dim], self.realised(z[..., self.code_dim :])], -1)
+
+
+class WorldModel(nn.Module):
+    """Everything that is learned. All methods take any leading batch dimensions [...].
+
+    Args:
+        obs_dim: Entries of an observation, history included [O].
+        action_dim: Entries of an action [A].
+        decode_dim: Leading observation entries that `decode` returns (the raw observation without history).
+        latent_dim: Entries of the code that the encoder makes, a multiple of simnorm_dim.
+        memory_dim: Last entries of the observation, past actions newest first, that the latent carries as they are. A
+            latent then has D = latent_dim + memory_dim entries, and the dynamics need not learn to remember.
+        mlp_dim, enc_dim: Hidden sizes of the heads and of the encoder.
+        enc_layers: Hidden layers of the encoder.
+        num_q: Members of the critic ensemble [E].
+        simnorm_dim: Entries of one SimNorm group.
+        num_bins, vmin, vmax: Two-hot bins of reward and value, on a symlog scale.
+        dropout: Probability on the first layer of every critic while training.
+        reward_from: "next": reward is read from the latent it is received in, so that it cannot hide the simulator's
+            dynamics; "current": from (z, a), as TD-MPC2 has it.
+
+    Raises:
+        ValueError: If latent_dim is no multiple of simnorm_dim, decode_dim exceeds obs_dim, num_q < 2, or reward_from
+            is unknown.
+    """
+
+    def __init__(
+        self,
+        *,
+        obs_dim: int,
+        action_dim: int,
+        decode_dim: int,
+        latent_dim: int,
+        memory_dim: int = 0,
+        mlp_dim: int,
+        enc_dim: int,
+        enc_layers: int = 2,
+        num_q: int,
+        simnorm_dim: int = 8,
+        num_bins: int = 101,
+        vmin: float = -10.0,
+        vmax: float = 10.0,
+        dropout: float = 0.01,
+        reward_from: str = "next",
+    ) -> None:
+        self_sizes = {k: v for k, v in locals().items() if k not in ("self", "__class__")}
+        super().__init__()
+        if latent_dim % simnorm_dim:
+            raise ValueError(f"latent_dim={latent_dim} is not a multiple of simnorm_dim={simnorm_dim}.")
+        if memory_dim % action_dim or not 0 <= memory_dim < obs_dim:
+            raise ValueError(
+                f"memory_dim={memory_dim} must be whole actions (action_dim={action_dim}) of the observation."
+            )
+        if not 1 <= decode_dim <= obs_dim:
+            raise ValueError(f"decode_dim={decode_dim} must lie between 1 and obs_dim={obs_dim}.")
+        if num_q < 2:
+            raise ValueError(f"num_q={num_q}: the target is the minimum of two critics, so at least 2 are needed.")
+        if reward_from not in REWARD_FROM:
+            raise ValueError(f"reward_from={reward_from!r}. Available: {', '.join(REWARD_FROM)}.")
+        self.sizes: dict[str, int | float | str] = self_sizes  # what rebuilds this model: WorldModel(**sizes)
+        self.obs_dim, self.action_dim, self.memory_dim = obs_dim, action_dim, memory_dim
+        self.latent_dim = latent_dim + memory_dim
+        self.num_q, self.reward_from = num_q, reward_from
+
+        code_dim, latent_dim = latent_dim, self.latent_dim
+        pair = latent_dim + action_dim
+        self.two_hot = TwoHot(num_bins, vmin, vmax)
+        self.normalizer = Normalizer(obs_dim)
+        self.encoder = mlp([obs_dim - memory_dim, *[enc_dim] * enc_layers, code_dim], out=SimNorm(simnorm_dim))
+        self.dynamics = Dynamics(code_dim, memory_dim, action_dim, mlp_dim, simnorm_dim)
+        self.reward_head = mlp([pair, mlp_dim, mlp_dim, num_bins], zero_out=True)
+        self.q_ensemble = Ensemble(
+            mlp([pair, mlp_dim, mlp_dim, num_bins], dropout=dropout, zero_out=True) for _ in range(num_q)
+        )
+        self.target_q = copy.deepcopy(self.q_ensemble).requires_grad_(False)
+        self.value_head = mlp([latent_dim, mlp_dim, mlp_dim, num_bins], zero_out=True)
+        self.policy_head = mlp([latent_dim, mlp_dim, mlp_dim, 2 * action_dim])
+        self.decoder = mlp([latent_dim, mlp_dim, decode_dim])
+
+    # -- what a planner calls ------------------------------------------------------------------------------------------
+
+    def next(self, z: Tensor, action: Tensor) -> Tensor:
+        """Latent after `action` [..., A] in latent `z` [..., D]: [..., D]."""
+        return by_blocks(self.dynamics, z, action)
+
+    def reward(self, z: Tensor, action: Tensor, next_z: Tensor) -> Tensor:
+        """Expected reward of the transition, reward units, [...]."""
+        seen = next_z if self.reward_from == "next" else z
+        return by_blocks(lambda s, a: self.two_hot.decode(self.reward_head(torch.cat([s, a], -1))), seen, action)
+
+    def terminal_value(self, z: Tensor) -> Tensor:
+        """V(z), discounted reward units, [...]; at transfer the frozen V sees each command as it was realised."""
+        return by_blocks(lambda s: self.two_hot.decode(self.value_head(self.dynamics.as_simulated(s))), z)
+
+    def policy_prior(self, z: Tensor, noise: Tensor | None) -> Tensor:
+        """Action of the policy in [-1, 1], [..., A]; noise None gives tanh of the mean."""
+        mean, log_std = self._policy_moments(z)
+        return torch.tanh(mean if noise is None else mean + log_std.exp() * noise)
+
+    # -- what learning calls -------------------------------------------------------------------------------------------
+
+    def encode(self, observation: Tensor) -> Tensor:
+        """Latent of a raw observation, [..., O] -> [..., D]."""
+        seen = self.obs_dim - self.memory_dim
+        code = by_blocks(lambda o: self.encoder(self.normalizer(o)[..., :seen]), observation)
+        return torch.cat([code, observation[..., seen:]], -1) if self.memory_dim else code
+
+    def decode(self, z: Tensor) -> Tensor:
+        """Leading entries of the observation in raw units, [..., decode_dim]. Never trains the latent."""
+        return self.normalizer.inverse(self.decoder(z.detach()))
+
+    def reward_logits(self, z: Tensor, action: Tensor, next_z: Tensor) -> Tensor:
+        """Two-hot logits of the reward, [..., num_bins]."""
+        return self.reward_head(torch.cat([next_z if self.reward_from == "next" else z, action], -1))
+
+    def q_logits(
+        self, z: Tensor, action: Tensor, *, target: bool = False, heads: Sequence[int] | None = None
+    ) -> Tensor:
+        """Two-hot logits of the chosen critics (all by default), [E, ..., num_bins]."""
+        return (self.target_q if target else self.q_ensemble)(torch.cat([z, action], -1), heads)
+
+    def q(self, z: Tensor, action: Tensor, *, target: bool = False, heads: Sequence[int] | None = None) -> Tensor:
+        """Q of the chosen critics (all by default), [E, ...]."""
+        return self.two_hot.decode(self.q_logits(z, action, target=target, heads=heads))
+
+    def policy(self, z: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+        """Reparameterised action [..., A] and its exact log-density [...]; noise is standard normal [..., A]."""
+        return gaussian_tanh(*self._policy_moments(z), noise)
+
+    def _policy_moments(self, z: Tensor) -> tuple[Tensor, Tensor]:
+        mean, log_std = by_blocks(self.policy_head, z).chunk(2, -1)
+        return mean, LOG_STD_MIN + 0.5 * (LOG_STD_MAX - LOG_STD_MIN) * (torch.tanh(log_std) + 1)
+
+    # -- changes of the model itself -----------------------------------------------------------------------------------
+
+    def add_residual(self, mlp_dim: int = 64) -> None:
+        """Freeze the dynamics and add a trainable correction to its logits that starts at exactly zero.
+
+        Raises:
+            ValueError: If there is one already.
+        """
+        if self.dynamics.residual is not None:
+            raise ValueError("The dynamics already have a residual; add_residual works once.")
+        self.dynamics.base.requires_grad_(False)
+        pair = self.latent_dim + self.action_dim
+        residual = mlp([pair, mlp_dim, self.dynamics.code_dim], zero_out=True)
+        self.dynamics.residual = residual.to(next(self.parameters()).device)
+
+    @torch.no_grad()
+    def add_command_map(self) -> None:
+        """Let the dynamics learn what the machine makes of a command; starts as exactly the identity.
+
+        Raises:
+            ValueError: If there is one already.
+        """
+        if self.dynamics.command is not None:
+            raise ValueError("The dynamics already have a command map; add_command_map works once.")
+        command = nn.Linear(self.action_dim + self.memory_dim, self.action_dim)
+        command.weight.copy_(torch.eye(self.action_dim, self.action_dim + self.memory_dim))
+        command.bias.zero_()
+        self.dynamics.command = command.to(next(self.parameters()).device)
+
+    @torch.no_grad()
+    def update_targets(self, rate: float) -> None:
+        """Move the target critics toward the critics: target += rate (critic - target)."""
+        for target, critic in zip(self.target_q.parameters(), self.q_ensemble.parameters(), strict=True):
+            target.lerp_(critic, rate)
+
+    def train(self, mode: bool = True) -> "WorldModel":
+        """Training mode (dropout in the critics); the target critics never drop out."""
+        super().train(mode)
+        self.target_q.eval()
+        return self
+
+    def __repr__(self) -> str:
+        count = {part: sum(p.numel() for p in getattr(self, part).parameters()) for part in PARTS}
+        lines = [f"  {part:<12}{n:>12,}" for part, n in count.items() if n]
+        total = sum(n for part, n in count.items() if part != "target_q")
+        return "\n".join([f"WorldModel({total:,} parameters without targets)", *lines])

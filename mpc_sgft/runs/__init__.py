@@ -1,0 +1,1 @@
+"""The loops: pretrain, deploy, evaluate, and the rollouts they are made of."""

@@ -1,0 +1,141 @@
+"""From a config to the objects of a run: the only place where names in yaml become things."""
+
+import logging
+from pathlib import Path
+from typing import Any
+
+import torch
+from hydra.utils import instantiate
+from omegaconf import DictConfig, OmegaConf
+
+import mpc_sgft
+from envs import effects, randomize
+from envs.backends.sim import SimBackend
+from envs.env import ControlEnv
+from mpc_sgft.command.errors import UserError, from_config
+from mpc_sgft.learning.agent import Agent
+from mpc_sgft.learning.world_model import WorldModel
+from mpc_sgft.storage import checkpoint
+from planners.memory import keep_freed_memory
+
+
+def device(cfg: DictConfig) -> torch.device:
+    """The device that `device=` asks for; auto takes CUDA where there is one.
+
+    Raises:
+        UserError: If CUDA is asked for and absent.
+    """
+    if cfg.device == "cuda" and not torch.cuda.is_available():
+        raise UserError("device=cuda, but PyTorch finds no CUDA device here. Use device=cpu or device=auto.")
+    return torch.device("cuda" if cfg.device != "cpu" and torch.cuda.is_available() else "cpu")
+
+
+def prepare_process(cfg: DictConfig) -> None:
+    """Threads and memory of this process, for speed; call once at the start."""
+    torch.set_num_threads(cfg.torch_threads)
+    keep_freed_memory()
+    logging.getLogger("torchrl").setLevel(logging.WARNING)  # it announces every buffer it creates
+
+
+def make_env(cfg: DictConfig, num_envs: int, *, randomised: bool = False, learning: bool = False) -> ControlEnv:
+    """The task in simulation with the effects of `cfg.gap`.
+
+    Args:
+        cfg: The run's config.
+        num_envs: Copies stepped side by side [N].
+        randomised: Each episode draws its own model.
+        learning: The episodes are learned from, not measured: they start as `cfg.task.in_training` says.
+
+    Raises:
+        UserError: For an unknown effect, a parameter out of bounds, or a draw that names nothing.
+    """
+    with from_config("task"):
+        differs = cfg.task.get("in_training") or {} if learning else {}
+        task = instantiate({**cfg.task.env, **differs}, _convert_="all")
+    noise = {}
+    with from_config("gap"):
+        present = effects.load(OmegaConf.to_container(cfg.gap.effects, resolve=True))  # type: ignore[arg-type]
+    with from_config("randomize"):
+        draws = []
+        if randomised:
+            draws = randomize.load(OmegaConf.to_container(cfg.randomize.draws, resolve=True))  # type: ignore[arg-type]
+            noise = {"noise_sd": cfg.randomize.noise_sd, "noise_probability": cfg.randomize.noise_probability}
+    with from_config("gap"):
+        backend = SimBackend(task, num_envs, effects=present, draws=draws, **noise)
+    return ControlEnv(backend, history=cfg.task.history)
+
+
+def make_planner(cfg: DictConfig, action_dim: int):
+    """The planner of `cfg.planner`.
+
+    Raises:
+        UserError: For a number that the planner refuses.
+    """
+    with from_config("planner"):
+        return instantiate(cfg.planner, action_dim=action_dim, discount=cfg.task.discount, _convert_="all")
+
+
+def make_agent(cfg: DictConfig, env: ControlEnv) -> Agent:
+    """A fresh agent of the size `cfg.model` for an environment's observation and action."""
+    torch.manual_seed(cfg.seed)
+    with from_config("model"):
+        sizes = {"obs_dim": env.obs_dim, "action_dim": env.action_dim, "decode_dim": env.raw_dim}
+        model = instantiate(cfg.model, memory_dim=env.history * env.action_dim, **sizes)
+    with from_config("train"):
+        return instantiate(cfg.train.agent, model=model, seed=cfg.seed, device=device(cfg), discount=cfg.task.discount)
+
+
+def load_agent(cfg: DictConfig) -> tuple[Agent, dict[str, Any]]:
+    """The agent of `cfg.checkpoint`, or of the shipped checkpoint, and the checkpoint's header.
+
+    Raises:
+        UserError: If the checkpoint is missing, corrupt, of another task, or of another size than a `model=` that was
+            asked for.
+    """
+    path = cfg.checkpoint if cfg.checkpoint is not None else shipped(cfg.chosen.task)
+    asked = any(text.startswith("model") for text in cfg.overrides)
+    sizes = OmegaConf.to_container(cfg.model, resolve=True) if asked else {}
+    assert isinstance(sizes, dict)
+    sizes.pop("_target_", None)
+    try:
+        loaded = checkpoint.load(path, task=cfg.chosen.task, sizes=sizes, device=device(cfg))  # type: ignore[arg-type]
+    except checkpoint.CheckpointError as error:
+        raise UserError(str(error)) from error
+    for name in ("history", "discount"):
+        if loaded.meta[name] != cfg.task[name]:
+            raise UserError(
+                f"{path} was trained with task.{name}={loaded.meta[name]}, this run has {cfg.task[name]}. "
+                f"Leave task.{name} out, or pretrain again."
+            )
+    with from_config("train"):
+        agent = instantiate(
+            cfg.train.agent, model=loaded.model, seed=cfg.seed, device=device(cfg), discount=cfg.task.discount
+        )
+    return agent, loaded.meta
+
+
+def check_fits(model: WorldModel, env: ControlEnv) -> None:
+    """Refuse a checkpoint whose sizes are not those of the environment.
+
+    Raises:
+        UserError: With what was expected and found.
+    """
+    for name, here in (("obs_dim", env.obs_dim), ("action_dim", env.action_dim), ("decode_dim", env.raw_dim)):
+        if model.sizes[name] != here:
+            raise UserError(
+                f"the checkpoint has {name}={model.sizes[name]}, this task has {here} (task.env.control, task.history?)"
+            )
+
+
+def shipped(task: str) -> Path:
+    """The checkpoint that comes with the package for a task.
+
+    Raises:
+        UserError: If there is none.
+    """
+    folder = Path(mpc_sgft.__file__).parent / "assets"
+    path = folder / f"{task}.safetensors"
+    if not path.is_file():
+        have = ", ".join(sorted(p.stem for p in folder.glob("*.safetensors"))) or "none"
+        raise UserError(f"no checkpoint is shipped for task {task!r} (shipped: {have}). Give checkpoint=RUN_FOLDER.")
+    return path

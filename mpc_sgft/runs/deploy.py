@@ -1,0 +1,314 @@
+"""The deployment loop: drive a real rollout, record it, learn from it, measure, show, save. Nothing real is lost."""
+
+import json
+import time
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig
+
+from envs.backends.base import BackendError
+from envs.env import ControlEnv
+from mpc_sgft.command.errors import Stopped, UserError, disk_error
+from mpc_sgft.learning.agent import Agent
+from mpc_sgft.learning.audit import audit, write_audit
+from mpc_sgft.learning.transfer import Transfer, open_loop_error
+from mpc_sgft.runs import build, robot
+from mpc_sgft.runs.collect import Score, collect, planner_policy, score, score_of
+from mpc_sgft.runs.pretrain import EVAL_SEED, StopRequest
+from mpc_sgft.runs.real_rollout import begin, drive
+from mpc_sgft.session import person
+from mpc_sgft.session.operator import Nobody, Operator
+from mpc_sgft.session.verdicts import Verdicts
+from mpc_sgft.storage import checkpoint, run_folder
+from mpc_sgft.storage.episode_file import read_episode
+from mpc_sgft.storage.metrics import GrowingTable, MetricLogger, progress
+from mpc_sgft.storage.rollout import Rollout, from_episode
+from mpc_sgft.views.deploy_view import DeployViewer
+from planners.policy import PolicyPlanner
+
+REAL_SEED = 2_000_000  # real rollouts never share a seed with evaluation or pretraining
+
+
+def deploy(cfg: DictConfig) -> int:
+    """Adapt a pretrained agent with real rollouts; returns the exit code."""
+    agent, _ = build.load_agent(cfg)
+    real, operator = cfg.backend.name == "franka", person.make_operator(cfg)
+    env = robot.make_env(cfg, operator.place) if real else build.make_env(cfg, 1)
+    build.check_fits(agent.model, env)
+    with operator, closing(env.backend):
+        if real:
+            robot.connect(env, operator)
+        if real and cfg.backend.dry_run:
+            return robot.dry_run(cfg, agent.model, env)
+        run = Deployment(cfg, agent, env, None if real else build.make_env(cfg, cfg.eval_episodes), operator)
+        try:
+            summary = run.loop()
+        except BackendError as error:
+            if operator.stopping:
+                raise Stopped(run.how_to_go_on()) from error
+            raise UserError(f"{error} {run.how_to_go_on()}") from error
+        except OSError as error:  # closing the backend, on the way out, brings the arm to rest
+            then = f"Make room. Every whole step is on disk, {run.how_to_go_on()}"
+            message = disk_error(error, then)
+            if message is None:
+                raise
+            raise UserError(message) from error
+    print(json.dumps(summary))
+    return 0
+
+
+def make_transfer(cfg: DictConfig, agent: Agent, episode_steps: int) -> Transfer:
+    """Freeze a pretrained agent as `method` says, and what trains the rest of it."""
+    t, sgft = cfg.transfer, cfg.method == "sgft"
+    ours = {"anchor": t.anchor, "residual": t.residual, "command_map": t.command_map, "rho": t.rho}
+    agent.freeze_for_transfer(cfg.method, horizon=cfg.planner.horizon, **(ours if sgft else {}))
+    return Transfer(
+        agent,
+        capacity=(cfg.rollouts + 1) * episode_steps,
+        slice_len=t.slice_len if sgft else cfg.train.replay.slice_len,
+        batch_size=cfg.train.replay.batch_size,
+        seed=cfg.seed,
+        updates=t.updates if cfg.method != "zero_shot" else 0,
+        gate=t.gate and sgft,
+        margin=t.gate_margin,
+        memory=t.gate_memory,
+    )
+
+
+class Deployment:
+    """State of one deployment and its folder. Without a judge, the real rollouts themselves are the measure."""
+
+    def __init__(
+        self, cfg: DictConfig, agent: Agent, env: ControlEnv, judge: ControlEnv | None, operator: Operator | None = None
+    ):
+        self.cfg, self.env, self.judge = cfg, env, judge
+        self.operator: Operator = operator or Nobody(quiet=cfg.quiet)
+        self.folder = run_folder.start(cfg)
+        (self.folder / "episodes").mkdir(exist_ok=True)
+        build.prepare_process(cfg)
+        self.planner = build.make_planner(cfg, env.action_dim)
+        self.transfer = make_transfer(cfg, agent, env.task.episode_steps)
+        self.frozen = agent.frozen_hash()
+        self.state: dict[str, Any] = {"rollouts": 0, "aborted": 0, "scores": {}, "seconds": 0.0, "successes": 0}
+        self.state |= {"interventions": 0, "rerecorded": 0}
+        self.state["outcomes"] = []  # (success, return) of each real rollout
+        if cfg.resume is not None:
+            self._resume()
+        self.logger = self.make_logger(self.state["rollouts"] if cfg.resume is not None else None)
+        self.metrics: dict[str, float] = {}  # of the last rollout
+        self.verdicts = Verdicts(self, ask=person.asks(cfg))
+        self.stop = StopRequest("rollout")
+        self.viewer = (
+            DeployViewer(self.folder / "run.rrd", env, resume=cfg.resume is not None) if cfg.log.rerun else None
+        )
+        self.began = time.monotonic() - self.state["seconds"]
+
+    def loop(self) -> dict[str, Any]:
+        """Run what is left, and write the summary."""
+        cfg, table = self.cfg, None if self.cfg.quiet else GrowingTable()
+        if self.judge and not self.state["scores"]:
+            self.evaluate(table, {})
+            self.save()
+        if self.viewer:
+            self.viewer.value_map("before", self.transfer.acting)
+        hidden = cfg.quiet or self.operator.present  # the page shows the same
+        done = self.state["rollouts"]
+        bar = progress(cfg.rollouts, initial=done, desc=f"deploy {cfg.method}", unit="rollout", disable=hidden)
+        self.show_counts()
+        while self.state["rollouts"] < cfg.rollouts:
+            number = self.state["rollouts"] + 1
+            rollout = self._rollout(number)
+            if rollout is not None:
+                rollout = self.verdicts.of(rollout, number)
+            if self.operator.stopping:
+                raise Stopped(self.how_to_go_on())  # what was recorded counts when the session goes on
+            if rollout is None:
+                continue
+            self._count(rollout, number, table)
+            self.operator.rest()
+            self.verdicts.late(number)
+            bar.update(self.state["rollouts"] - bar.n)
+            bar.set_postfix(real_success=f"{self.state['successes']}/{self.state['rollouts']}")
+            if self.stop.asked or self.operator.stopping:
+                raise Stopped(self.how_to_go_on())
+        bar.close()
+        return self._finish()
+
+    def _count(self, rollout: Rollout, number: int, table: GrowingTable | None) -> None:
+        """Measure a rollout, learn from it unless a person had the arm, and save."""
+        if self.operator.present:
+            self.verdicts.remember()
+        self.operator.enter("measuring", number)
+        metrics = self._measure(rollout, number)
+        valid = rollout.steps[~rollout.steps["next", "invalid"][:, 0]]
+        if len(valid) >= self.transfer.slice_len and not rollout.intervened:
+            self.operator.enter("training", number)
+            metrics |= self.transfer.learn(valid, self.operator.track)
+        self.state["rollouts"] = number
+        self.state["aborted"] += rollout.aborted is not None
+        self.state["interventions"] += rollout.intervened
+        self.state["successes"] += rollout.success
+        self.state["outcomes"].append((rollout.success, metrics["real_return"]))
+        if number % self.cfg.eval_every == 0 or number == self.cfg.rollouts:
+            self.evaluate(table, metrics)
+        self.logger.log(number, metrics)
+        self.metrics = metrics
+        self.save()
+        self.show_counts()
+
+    def how_to_go_on(self) -> str:
+        """What is saved, and the command that continues."""
+        done = self.state["rollouts"]
+        return f"saved after {done} rollouts. Go on: python -m mpc_sgft.deploy --resume {self.folder}"
+
+    def path(self, number: int) -> Path:
+        """Where a rollout is recorded."""
+        return self.folder / "episodes" / f"{number:04d}.mcap"
+
+    def _rollout(self, number: int) -> Rollout | None:
+        """The next real rollout, or None if the one before is to be driven again first.
+
+        One that a killed process recorded is used as it is, not driven again.
+        """
+        cfg, path = self.cfg, self.path(number)
+        if path.exists():
+            episode = read_episode(path)
+            if episode.transitions:
+                return from_episode(episode, number)
+            path.rename(path.with_suffix(".empty.mcap"))  # the robot never moved
+        planner = self.planner
+        if number <= cfg.warmup:
+            planner = PolicyPlanner(
+                action_dim=self.env.action_dim, horizon=cfg.planner.horizon, discount=cfg.task.discount
+            )
+        model = self.transfer.pretrained if number <= cfg.warmup else self.transfer.acting
+        seed = REAL_SEED + 1000 * cfg.seed + number
+        self.operator.enter("resetting", number - 1)
+        try:
+            state = begin(self.env, seed)
+        except BackendError:
+            self.verdicts.late(number - 1)
+            raise
+        if self.verdicts.again(number - 1):
+            return None
+        return drive(
+            self.env,
+            model,
+            planner,
+            path,
+            number=number,
+            seed=seed,
+            noise=cfg.transfer.action_noise,
+            candidate_steps=tuple(cfg.candidate_steps),
+            operator=self.operator,
+            state=state,
+        )
+
+    def show_counts(self) -> None:
+        """Tell the operator how the session stands."""
+        s = self.state
+        text = f"{s['successes']} of {s['rollouts']}, {s['aborted']} aborted, {s['interventions']} taken over"
+        self.operator.tell(successes=f"{text}, {s['rerecorded']} driven again")
+
+    def make_logger(self, resume_step: int | None) -> MetricLogger:
+        """For metrics from here on; rows after `resume_step` are dropped."""
+        log = self.cfg.log
+        return MetricLogger(
+            self.folder, csv=log.csv, tensorboard=log.tensorboard, wandb=log.wandb, resume_step=resume_step
+        )
+
+    def _measure(self, rollout: Rollout, number: int) -> dict[str, float]:
+        """Model error and improvability of a rollout under the model that drove it, and its view in rerun."""
+        model, horizon = self.transfer.acting, self.cfg.planner.horizon
+        error = open_loop_error(model, rollout.steps, horizon)
+        found = audit(model, rollout.steps, self.cfg.task.discount, seed=number)
+        write_audit(self.folder / "audit.csv", number, rollout.steps, found.margin, self.env.task.observation_names)
+        metrics = {
+            "real_success": float(rollout.success),
+            "real_return": float(rollout.steps["next", "reward"].sum()),
+            "aborted": float(rollout.aborted is not None),
+            "audit_share": found.share,
+            **{f"model_error_{h + 1}": float(error[:, h].nanmean()) for h in range(min(horizon, len(error)))},
+        }
+        if rollout.plan_ms is not None:
+            metrics["planner_ms"] = float(rollout.plan_ms.mean())
+        if self.viewer:
+            self.viewer.episode(rollout, model, error, number, self.cfg.task.discount)
+        return metrics
+
+    def evaluate(self, table: GrowingTable | None, metrics: dict[str, float]) -> None:
+        """Measure success now: into the state, `metrics` and the table."""
+        result = self._score()
+        self.state["scores"][self.state["rollouts"]] = result._asdict()
+        metrics |= {"success": result.success, "return": result.episode_return}
+        if self.viewer:
+            self.viewer.success(result.success)
+        if table:
+            table.row(
+                rollouts=self.state["rollouts"],
+                success=result.success,
+                **{"return": result.episode_return},
+                model_error=metrics.get("model_error_1"),
+                audit_share=metrics.get("audit_share"),
+                planner_ms=metrics.get("planner_ms"),
+                seconds=time.monotonic() - self.began,
+            )
+
+    def _score(self) -> Score:
+        """Of evaluation episodes; without a judge, of the real rollouts since the last time."""
+        if self.judge is None:
+            latest = self.state["outcomes"][max(self.state["scores"], default=0) :]
+            return score_of(*zip(*latest, strict=True))
+        act = planner_policy(self.transfer.acting, self.planner, EVAL_SEED)
+        return score(collect(self.judge, act, seed=EVAL_SEED))
+
+    def save(self) -> None:
+        """Weights and exact state."""
+        self.state["seconds"] = time.monotonic() - self.began
+        path = self.folder / "checkpoint"
+        meta = checkpoint.describe(self.cfg, self.transfer.acting)
+        checkpoint.save(path / "model.safetensors", self.transfer.acting, meta)
+        checkpoint.save_state(path / "state.pt", {"loop": self.state, "transfer": self.transfer.state_dict()})
+
+    def _resume(self) -> None:
+        path = self.folder / "checkpoint" / "state.pt"
+        if path.exists():
+            stored = checkpoint.load_state(path)
+            self.state |= stored["loop"]
+            self.transfer.load_state_dict(stored["transfer"])
+
+    def _finish(self) -> dict[str, Any]:
+        agent = self.transfer.agent
+        if agent.frozen_hash() != self.frozen:
+            raise AssertionError("a frozen tensor changed during deployment; this is a defect, please report it")
+        if self.viewer:
+            self.viewer.value_map("after", self.transfer.acting)
+            self.viewer.close()
+        scores, cfg = self.state["scores"], self.cfg
+        reached = [int(k) for k, s in scores.items() if s["success"] >= 0.9]
+        summary = {
+            "task": cfg.chosen.task,
+            "gap": cfg.chosen.gap,
+            "method": cfg.method,
+            "seed": cfg.seed,
+            "real_rollouts": self.state["rollouts"],
+            "aborted_rollouts": self.state["aborted"],
+            "interventions": self.state["interventions"],
+            "rerecorded": self.state["rerecorded"],
+            "zero_shot_success": scores[0]["success"] if 0 in scores else None,
+            "final_success": scores[max(scores)]["success"],
+            "final_interval": [scores[max(scores)]["success_low"], scores[max(scores)]["success_high"]],
+            "evaluation_episodes": scores[max(scores)]["episodes"],
+            "rollouts_to_90": min(reached) if reached else None,
+            "curve": {str(k): s["success"] for k, s in scores.items()},
+            "horizon": cfg.planner.horizon,
+            "frozen_sha256": self.frozen,
+            "wall_seconds": round(time.monotonic() - self.began, 1),
+            "robot": self.env.backend.report() if self.judge is None else None,
+            "rrd": str(self.folder / "run.rrd") if self.viewer else None,
+        }
+        (self.folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
+        self.logger.close()
+        return summary

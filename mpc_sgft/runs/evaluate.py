@@ -1,0 +1,60 @@
+"""Success of a checkpoint, or of a simple policy, on any task and gap."""
+
+import json
+from typing import cast
+
+from omegaconf import DictConfig
+from tensordict import TensorDict
+
+from mpc_sgft.command.errors import UserError, from_config
+from mpc_sgft.runs import build
+from mpc_sgft.runs.collect import Act, collect, planner_policy, random_policy, score, scripted_policy
+from mpc_sgft.runs.pretrain import EVAL_SEED
+from mpc_sgft.storage import run_folder
+
+CHUNK = 100  # episodes side by side
+
+
+def evaluate(cfg: DictConfig) -> int:
+    """Run the episodes, print and save the result as JSON; returns the exit code."""
+    if cfg.backend.name != "sim":
+        raise UserError("evaluate runs in simulation. On the robot: deploy --backend franka method=zero_shot.")
+    env = build.make_env(cfg, min(cfg.episodes, CHUNK), randomised=True)
+    if cfg.episodes % env.batch_size[0]:
+        raise UserError(f"episodes={cfg.episodes}: more than {CHUNK} must be a multiple of {CHUNK}.")
+    act = _policy(cfg, env)
+    folder = run_folder.start(cfg)
+    build.prepare_process(cfg)
+    parts = [collect(env, act, seed=EVAL_SEED + cfg.seed + i) for i in range(cfg.episodes // env.batch_size[0])]
+    result = score(cast(TensorDict, TensorDict.cat(parts)))
+    summary = {
+        "task": cfg.chosen.task,
+        "gap": cfg.chosen.gap,
+        "randomize": cfg.chosen.randomize,
+        "policy": cfg.policy,
+        "planner": cfg.chosen.planner if cfg.policy == "planner" else None,
+        "seed": cfg.seed,
+        "episodes": result.episodes,
+        "success": result.success,
+        "success_interval": [result.success_low, result.success_high],
+        "return": result.episode_return,
+        "unstable_episodes": env.backend.counters["unstable"],
+    }
+    if cfg.video:
+        from mpc_sgft.views.video import write_video
+
+        summary["video"] = str(write_video(folder / "episode.mp4", build.make_env(cfg, 1), act, EVAL_SEED + cfg.seed))
+    (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
+    print(json.dumps(summary))
+    return 0
+
+
+def _policy(cfg: DictConfig, env) -> Act:
+    if cfg.policy in ("zero", "random"):
+        return random_policy(env, cfg.seed, scale=float(cfg.policy == "random"))
+    if cfg.policy == "scripted":
+        return scripted_policy(env)
+    agent, _ = build.load_agent(cfg)
+    build.check_fits(agent.model, env)
+    with from_config("planner"):
+        return planner_policy(agent.model, build.make_planner(cfg, env.action_dim), cfg.seed)

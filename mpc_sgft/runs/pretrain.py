@@ -1,0 +1,185 @@
+"""The pretraining loop: collect a round of randomised episodes, learn from the buffer, measure, save."""
+
+import json
+import signal
+import time
+from types import FrameType
+
+import torch
+from hydra.utils import instantiate
+from omegaconf import DictConfig
+from torch import Tensor
+
+from envs.env import ControlEnv
+from mpc_sgft.command.errors import Stopped, UserError
+from mpc_sgft.learning.agent import Agent
+from mpc_sgft.runs import build
+from mpc_sgft.runs.collect import Act, collect, planner_policy, random_policy, score
+from mpc_sgft.storage import checkpoint, run_folder
+from mpc_sgft.storage.metrics import MetricLogger, progress
+from planners.policy import PolicyPlanner
+
+EVAL_SEED = 1_000_000  # evaluation episodes never share a seed with collected ones
+
+
+def pretrain(cfg: DictConfig) -> int:
+    """Pretrain until the target success is held or the transitions are spent; returns the exit code."""
+    folder = run_folder.start(cfg)
+    build.prepare_process(cfg)
+    env = build.make_env(cfg, cfg.num_envs, randomised=True, learning=True)
+    judge = build.make_env(cfg, cfg.eval_episodes, randomised=True)
+    agent = start_agent(cfg, env)
+    agent.horizon = cfg.imagined_steps
+    buffer = instantiate(cfg.train.replay, seed=cfg.seed)
+    state = {"round": 0, "updates": 0, "transitions": 0, "episodes": 0, "seconds": 0.0, "streak": 0}
+    saved = folder / "checkpoint" / "state.pt"
+    if cfg.resume is not None:
+        if not saved.is_file():
+            raise UserError(f"{folder} holds no checkpoint yet: nothing to resume. Start it again with run_dir=...")
+        stored = checkpoint.load_state(saved)
+        state = stored["loop"]
+        agent.load_state_dict(stored["agent"])
+        buffer.load_state_dict(stored["buffer"])
+
+    def save() -> None:
+        """Weights and exact state, at the end of a round."""
+        meta = checkpoint.describe(cfg, agent.averaged, extra={"transitions": state["transitions"]})
+        checkpoint.save(folder / "checkpoint" / "model.safetensors", agent.averaged, meta)
+        checkpoint.save_state(saved, {"loop": state, "agent": agent.state_dict(), "buffer": buffer.state_dict()})
+
+    stop = StopRequest("round")
+    logger = MetricLogger(
+        folder,
+        csv=cfg.log.csv,
+        tensorboard=cfg.log.tensorboard,
+        wandb=cfg.log.wandb,
+        resume_step=state["transitions"] if cfg.resume is not None else None,
+    )
+    bar = progress(cfg.transitions, initial=state["transitions"], desc="pretrain", disable=cfg.quiet)
+    result, began = None, time.monotonic() - state["seconds"]
+    while state["transitions"] < cfg.transitions:
+        first_round = state["transitions"] < cfg.random_transitions
+        act = random_policy(env, cfg.seed) if first_round else explorer(agent, cfg, state["round"])
+        data = collect(env, act, seed=_seed(cfg.seed, state["round"]), first_episode=state["episodes"])
+        buffer.extend(data)
+        state["transitions"] += data.numel()
+        state["episodes"] = int(data["episode"].max()) + 1
+        metrics: dict[str, float] = {"train_success": score(data).success}
+        agent.scale_learning_rates(0.5 ** (state["transitions"] / cfg.lr_halves_every))
+        agent.hold_value(state["transitions"] <= cfg.hold_value)
+        owed = int(state["transitions"] * cfg.updates_per_transition) - state["updates"]
+        for _ in range(owed):
+            metrics |= agent.update(buffer.sample())
+        state["updates"] += owed
+        state["round"] += 1
+        if state["round"] % cfg.eval_every == 0 or state["transitions"] >= cfg.transitions:
+            result = score(collect(judge, prior(agent), seed=EVAL_SEED))
+            metrics |= {"success": result.success, "return": result.episode_return}
+            state["streak"] = state["streak"] + 1 if result.success >= cfg.target_success else 0
+        state["seconds"] = time.monotonic() - began
+        env_log = {"unstable": env.backend.counters["unstable"], "seconds": state["seconds"]}
+        logger.log(state["transitions"], {"updates": state["updates"], **metrics, **env_log})
+        bar.update(state["transitions"] - bar.n)
+        bar.set_postfix(success=f"{result.success:.0%}" if result else "-", loss=f"{metrics.get('loss', 0):.2f}")
+        done = state["streak"] >= cfg.target_streak and state["transitions"] >= cfg.min_transitions
+        if stop.asked or done or state["round"] % cfg.save_every == 0:
+            save()
+        if stop.asked:
+            raise Stopped(
+                f"saved after {state['transitions']} transitions. Go on: python -m mpc_sgft.pretrain --resume {folder}"
+            )
+        if done:
+            break
+    save()
+    bar.close()
+    final_judge = build.make_env(cfg, cfg.final_episodes, randomised=True)
+    final = score(collect(final_judge, prior(agent), seed=EVAL_SEED + 1))
+    planner = build.make_planner(cfg, env.action_dim)
+    planned = score(collect(final_judge, planner_policy(agent.averaged, planner, cfg.seed), seed=EVAL_SEED + 1))
+    summary = {
+        "task": cfg.chosen.task,
+        "seed": cfg.seed,
+        "transitions": state["transitions"],
+        "updates": state["updates"],
+        "episodes_evaluated": final.episodes,
+        "success": planned.success,
+        "success_interval": [planned.success_low, planned.success_high],
+        "prior_success": final.success,
+        "return": planned.episode_return,
+        "unstable_episodes": env.backend.counters["unstable"],
+        "wall_seconds": round(time.monotonic() - began, 1),
+        "checkpoint": str(folder / "checkpoint" / "model.safetensors"),
+    }
+    (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
+    logger.close()
+    print(json.dumps(summary))
+    return 0
+
+
+def start_agent(cfg: DictConfig, env: ControlEnv) -> Agent:
+    """A fresh agent, or that of `checkpoint=` to go on from with new data.
+
+    Raises:
+        UserError: If the checkpoint does not fit, or was changed by a deployment.
+    """
+    if cfg.checkpoint is None:
+        return build.make_agent(cfg, env)
+    agent, meta = build.load_agent(cfg)
+    build.check_fits(agent.model, env)
+    changed = [part for part in ("command_map", "residual") if meta.get(part)]
+    if changed:
+        raise UserError(
+            f"checkpoint={cfg.checkpoint} comes from a deployment (it has a {changed[0]}): pretraining goes on from "
+            "pretrained checkpoints. Give the one that the deployment started from."
+        )
+    return agent
+
+
+def explorer(agent: Agent, cfg: DictConfig, round_number: int) -> Act:
+    """The policy with its own noise; a share of the environments also makes detours, so that the model sees mistakes.
+
+    A detour holds one action for some steps: none at all, or one drawn uniformly. Without, the critic never learns what
+    it is worth to rest where the puck should lie, because the policy, whose actions are noisy, never rests.
+    """
+    seed, detour = _seed(cfg.seed, round_number), cfg.detours
+    generator = torch.Generator().manual_seed(seed)
+    policy = PolicyPlanner(action_dim=agent.model.action_dim, horizon=1)
+    sample = planner_policy(agent.model, policy, seed, explore=True)
+    roaming = int(detour.share * cfg.num_envs)
+    left = torch.zeros(roaming, dtype=torch.long)  # steps of the detour that are left
+    held = torch.zeros(roaming, policy.action_dim)
+
+    def act(observation: Tensor, fresh: Tensor) -> Tensor:
+        action = sample(observation, fresh)
+        chance, kind = torch.rand(2, roaming, generator=generator)
+        length = torch.randint(detour.steps[0], detour.steps[1], (roaming,), generator=generator)
+        drawn = 2 * torch.rand(roaming, policy.action_dim, generator=generator) - 1
+        starts = (left == 0) & (chance < detour.rate)
+        left[:] = torch.where(starts, length, (left - 1).clamp(min=0))
+        held[starts] = torch.where(kind < detour.rest, 0.0, drawn.T).T[starts]
+        action[:roaming] = torch.where((left > 0)[:, None], held, action[:roaming])
+        return action
+
+    return act
+
+
+def prior(agent: Agent) -> Act:
+    """The mean action of the averaged policy prior."""
+    return planner_policy(agent.averaged, PolicyPlanner(action_dim=agent.model.action_dim, horizon=1), 0)
+
+
+class StopRequest:
+    """Ctrl-C asks a loop to stop at the end of its round or rollout; a second one stops at once."""
+
+    def __init__(self, unit: str) -> None:
+        self.asked, self.unit = False, unit
+        self._before = signal.signal(signal.SIGINT, self._ask)
+
+    def _ask(self, number: int, frame: FrameType | None) -> None:
+        self.asked = True
+        signal.signal(signal.SIGINT, self._before)
+        print(f"\nstopping after this {self.unit}; once more stops at once", flush=True)
+
+
+def _seed(seed: int, round_number: int) -> int:
+    return (seed * 1_000_003 + round_number) % 2**31

@@ -1,0 +1,160 @@
+"""What a run leaves on disk: weights to deploy, and the exact state to resume.
+
+`save` writes the model as safetensors, with everything needed to rebuild it in the header. `save_state` writes whatever
+a loop needs to go on with the same numbers. Both replace the earlier file only when the new one is complete on disk: a
+full disk or a kill leaves the earlier one.
+"""
+
+import hashlib
+import io
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import safetensors.torch
+import torch
+from omegaconf import DictConfig, OmegaConf
+from safetensors import SafetensorError, safe_open
+from torch import Tensor
+
+from mpc_sgft.learning.world_model import WorldModel
+from mpc_sgft.storage.whole_file import write_whole
+
+DIGEST_BYTES = 32  # SHA-256 in front of a saved state
+FORMAT = 1  # of the weights file; raise it when an old file can no longer be read
+WEIGHTS = Path("checkpoint") / "model.safetensors"  # inside a run folder
+
+
+class CheckpointError(ValueError):
+    """A checkpoint cannot be used. The message says which file, what was expected, what was found and what to do."""
+
+
+class Loaded(NamedTuple):
+    """A checkpoint, ready to act."""
+
+    model: WorldModel
+    meta: dict[str, Any]  # as `describe` made it
+
+
+def describe(cfg: DictConfig, model: WorldModel, extra: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """Header of a checkpoint: task, sizes, history, discount, format version, the whole config, and `extra`."""
+    config = OmegaConf.to_container(cfg, resolve=True)
+    assert isinstance(config, dict)
+    for path in ("run_dir", "resume", "checkpoint"):  # where it was made is nobody else's business
+        config.pop(path, None)
+    return {
+        "format": FORMAT,
+        "task": str(cfg.chosen.task),
+        "history": int(cfg.task.history),
+        "discount": float(cfg.task.discount),
+        "sizes": dict(model.sizes),
+        "residual": model.dynamics.residual is not None,
+        "command_map": model.dynamics.command is not None,
+        "config": config,
+        **(extra or {}),
+    }
+
+
+def save(path: Path | str, model: WorldModel, meta: Mapping[str, Any]) -> None:
+    """Write the weights and their header to `path` (.safetensors).
+
+    Raises:
+        OSError: If the file cannot be written; an earlier file is untouched.
+    """
+    tensors = {name: x.detach().cpu().contiguous() for name, x in model.state_dict().items()}
+    header = {"mpc_sgft": json.dumps(dict(meta)), "sha256": _digest(tensors)}
+    write_whole(Path(path), safetensors.torch.save(tensors, metadata=header))
+
+
+def load(
+    path: Path | str,
+    *,
+    task: str | None = None,
+    sizes: Mapping[str, Any] | None = None,
+    device: torch.device | str = "cpu",
+) -> Loaded:
+    """Rebuild a model from a run folder or a .safetensors file.
+
+    Args:
+        path: File, or a run folder that holds checkpoint/model.safetensors.
+        task: Name of the task that it must have been trained for; None accepts any.
+        sizes: Model sizes that it must have, e.g. {"obs_dim": 16}; others are free.
+        device: Where the model goes.
+
+    Raises:
+        CheckpointError: If there is no such file, it is corrupt, or it is for another task, size or format.
+    """
+    file = Path(path) / WEIGHTS if Path(path).is_dir() else Path(path)
+    if not file.is_file():
+        raise CheckpointError(
+            f"No checkpoint at {file}. Give a run folder of a finished pretrain, or a .safetensors file."
+        )
+    try:
+        with safe_open(file, framework="pt") as opened:
+            header = opened.metadata() or {}
+            tensors = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118, not a dict
+        meta = json.loads(header["mpc_sgft"])
+        found = {"format": meta["format"], "task": meta["task"], **meta["sizes"]}
+    except KeyError as err:
+        raise CheckpointError(f"{file} has no {err} in its header: it was not written by mpc_sgft. {_AGAIN}") from err
+    except (SafetensorError, OSError, ValueError, TypeError) as err:
+        raise CheckpointError(f"{file} is corrupt ({err}). {_AGAIN}") from err
+    expected = {"format": FORMAT, **({} if task is None else {"task": task}), **(sizes or {})}
+    for key, value in expected.items():
+        if found.get(key) != value:
+            raise CheckpointError(
+                f"{file} does not fit: expected {key}={value!r}, found {key}={found.get(key)!r}. "
+                "Choose the task and model it was trained with, or another checkpoint."
+            )
+    if header.get("sha256") != _digest(tensors):
+        raise CheckpointError(f"{file} is corrupt: its tensors do not match the checksum in its header. {_AGAIN}")
+    try:
+        model = WorldModel(**meta["sizes"])
+        if meta.get("residual"):
+            model.add_residual()
+        if meta.get("command_map"):
+            model.add_command_map()
+        model.load_state_dict(tensors)
+    except (TypeError, ValueError, RuntimeError) as err:
+        raise CheckpointError(f"{file} does not fit the sizes in its own header ({err}). {_AGAIN}") from err
+    return Loaded(model.to(device), meta)
+
+
+def save_state(path: Path | str, state: Mapping[str, Any]) -> None:
+    """Write the exact state of a loop: nested dicts, lists and tuples of tensors, numbers and strings.
+
+    Raises:
+        OSError: If the file cannot be written; an earlier file is untouched.
+    """
+    payload = io.BytesIO()
+    torch.save(dict(state), payload)
+    data = payload.getvalue()
+    write_whole(Path(path), hashlib.sha256(data).digest() + data)
+
+
+def load_state(path: Path | str) -> dict[str, Any]:
+    """Read what `save_state` wrote; runs no code from the file.
+
+    Raises:
+        CheckpointError: If there is no such file or it is corrupt.
+    """
+    file = Path(path)
+    if not file.is_file():
+        raise CheckpointError(f"No saved state at {file}. Start the run again without --resume.")
+    raw = file.read_bytes()
+    digest, data = raw[:DIGEST_BYTES], raw[DIGEST_BYTES:]
+    if hashlib.sha256(data).digest() != digest:
+        raise CheckpointError(f"{file} is corrupt: its content does not match its checksum. {_AGAIN}")
+    return torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
+
+
+_AGAIN = "Use another checkpoint or train again."
+
+
+def _digest(tensors: Mapping[str, Tensor]) -> str:
+    digest = hashlib.sha256()
+    for name, x in sorted(tensors.items()):
+        digest.update(f"{name} {tuple(x.shape)} {x.dtype}".encode())
+        digest.update(x.numpy().tobytes())
+    return digest.hexdigest()

@@ -1,0 +1,1 @@
+"""Everything drawn: the rerun viewer, value maps, films."""

@@ -1,0 +1,124 @@
+"""A rollout as the rerun viewer shows it: observations become points, plans become imagined paths."""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from envs.env import ControlEnv
+from mpc_sgft.learning.world_model import WorldModel
+from mpc_sgft.storage.rollout import Rollout
+from mpc_sgft.views.blueprint import Layout
+from mpc_sgft.views.episode_view import Candidates, EpisodeView
+from mpc_sgft.views.viewer import RunViewer
+from planners.base import imagine
+
+GRID = 41  # points of the value map along each axis
+
+
+def layout(env: ControlEnv) -> Layout:
+    """Where the viewer's cameras stand for a task."""
+    if "object" in env.task.points(np.zeros((1, env.raw_dim))):
+        return Layout(
+            eye=(1.18, -0.76, 0.46),
+            target=(0.385, 0.02, 0.025),
+            second_eye=(0.43, 0.0, 0.42),
+            second_target=(0.43, 0.0, -0.15),
+            object_radius=0.025,
+            object_height=0.03,
+            metrics=("success",),
+        )
+    return Layout(eye=(0.0, -3.0, 0.0), second_eye=(0.0, -3.0, 0.0), value_maps=(), metrics=("success",))
+
+
+class DeployViewer:
+    """Writes run.rrd of a deployment. The ghost is decoded from the latent by the model's decoder head.
+
+    Args:
+        path: The .rrd.
+        env: The task, for its model and its named points.
+        resume: Go on with a file that is there.
+    """
+
+    def __init__(self, path: Path, env: ControlEnv, *, resume: bool):
+        self.env, self.task = env, env.task
+        model = getattr(env.backend, "model", None)
+        self.viewer = RunViewer(path, model, control_dt=env.task.control_dt, layout=layout(env), resume=resume)
+        self.limits: tuple[float, float] | None = None
+
+    def episode(self, rollout: Rollout, model: WorldModel, error: Tensor, number: int, discount: float) -> None:
+        """Add one rollout; one read back from a file has no imagination to show."""
+        steps, names = rollout.steps, self.task.points(np.zeros((1, self.env.raw_dim)))
+        observation = torch.cat([steps["observation"], steps["next", "observation"][-1:]])
+        real = self._points(observation[:, : self.env.raw_dim])
+        title = f"rollout {number}" + (f" (aborted: {rollout.aborted})" if rollout.aborted else "")
+        reward = steps["next", "reward"][:, 0].numpy()
+        view = EpisodeView(
+            title=title,
+            ee=real.get("tip", np.zeros((len(observation), 3))),
+            object=real.get("object"),
+            qpos=rollout.qpos,
+            reward=reward,
+            model_error=error.numpy(),
+            success=rollout.success,
+        )
+        if rollout.plans is None or rollout.values is None:
+            self.viewer.episode(view)
+            return
+        view = view._replace(predicted_return=rollout.values.numpy(), plan_ms=rollout.plan_ms)
+        view = view._replace(real_return=_realised(model, steps["next"], reward, rollout.plans.shape[1], discount))
+        if names:
+            imagined = self._imagined(model, steps["observation"], rollout.plans)
+            paths = []
+            for t, plans, values in rollout.candidates:
+                many = self._imagined(model, steps["observation"][t].expand(len(plans), -1), plans)
+                paths.append(Candidates(t, many["tip"], values.numpy()))
+            view = view._replace(imagined_ee=imagined["tip"], imagined_object=imagined.get("object"), candidates=paths)
+        self.viewer.episode(view)
+
+    def value_map(self, name: str, model: WorldModel) -> None:
+        """V over the tip's place on the table with the puck in the middle of its range (the paper's Figure 7)."""
+        names = self.task.points(np.zeros((1, self.env.raw_dim)))
+        if "object" not in names:
+            return
+        extent = (-0.08, 0.56, -0.32, 0.32)
+        puck = (0.2, 0.0)
+        x, y = np.meshgrid(np.linspace(*extent[:2], GRID), np.linspace(*extent[2:], GRID), indexing="ij")
+        raw = np.stack([x.ravel(), y.ravel(), np.full(x.size, puck[0]), np.full(x.size, puck[1])], 1)
+        still = np.concatenate([np.tile(raw, (1, self.env.history + 1)), np.zeros((x.size, self.env.obs_dim))], 1)
+        observation = torch.from_numpy(still[:, : self.env.obs_dim]).float()
+        with torch.inference_mode():
+            values = model.terminal_value(model.encode(observation.to(next(model.parameters()).device)))
+        grid = values.cpu().numpy().reshape(GRID, GRID)
+        self.limits = self.limits or (float(grid.min()), float(grid.max()))
+        self.viewer.value_map(name, grid, extent, marks={"puck": puck}, limits=self.limits)
+
+    def success(self, share: float) -> None:
+        """Add the success of an evaluation."""
+        self.viewer.metrics(self.viewer.env_step, {"success": share})
+
+    def close(self) -> None:
+        self.viewer.close()
+
+    def _points(self, raw: Tensor) -> dict[str, np.ndarray]:
+        return self.task.points(raw.double().numpy())
+
+    def _imagined(self, model: WorldModel, observation: Tensor, plans: Tensor) -> dict[str, np.ndarray]:
+        """Points imagined along plans [M, H, A] from observations [M, O], each [M, H+1, 3]."""
+        device = next(model.parameters()).device
+        with torch.inference_mode():
+            latents = imagine(model, model.encode(observation.to(device)), plans.to(device))
+            return self._points(model.decode(latents).cpu())
+
+
+def _realised(model: WorldModel, following, reward: np.ndarray, horizon: int, discount: float) -> np.ndarray:
+    """What came of each step over the plan's horizon: rewards, then V of the latent reached, [T]."""
+    device = next(model.parameters()).device
+    with torch.inference_mode():
+        value = model.terminal_value(model.encode(following["observation"].to(device))).cpu().numpy()
+    out = np.empty_like(reward)
+    for t in range(len(reward)):
+        end = min(t + horizon, len(reward))
+        out[t] = (reward[t:end] * discount ** np.arange(end - t)).sum() + discount ** (end - t) * value[end - 1]
+    return out

@@ -1,0 +1,249 @@
+"""One rerun file a run: what the robot did, what the model imagined, what the planner weighed.
+
+Nothing here is called while a robot moves: an episode is buffered by its owner and sent once, as columns.
+
+Timelines: `env_step` counts the states shown, T + 1 for an episode of T steps, and goes on over episodes; `episode`
+counts episodes. Entities:
+
+| path                    | what                                                                                    |
+|-------------------------|-----------------------------------------------------------------------------------------|
+| world/robot             | the model, moved by qpos                                                                |
+| world/object            | the object, where the model does not contain it                                         |
+| world/trail/*           | the way of end effector and object so far in this episode                               |
+| world/imagined/*        | where the model, at this step, imagines end effector and object over the next H steps   |
+| world/ghost/*           | where it thought one step ago that they would be now                                    |
+| world/candidates        | the planner's candidate plans of selected steps, dark (worst) to yellow (best)          |
+| value_map/<name>        | a value over the end effector's x and y                                                 |
+| returns, model_error, … | plots                                                                                   |
+| episodes                | outcomes in words                                                                       |
+"""
+
+import struct
+import tempfile
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Self
+
+import mujoco
+import numpy as np
+import rerun as rr
+from rerun.chunk import Chunk, RrdReader
+
+from mpc_sgft.storage.whole_file import write_whole
+from mpc_sgft.views.blueprint import Layout, blueprint
+from mpc_sgft.views.episode_view import Candidates, EpisodeView, Rows, log_episode, log_series_styles
+from mpc_sgft.views.robot_view import RobotView
+from mpc_sgft.views.value_image import log_value_map
+
+__all__ = ["Candidates", "EpisodeView", "Layout", "RunViewer"]
+
+RRD_MAGIC, RRD_HEADER = b"RRF", 12  # how a file begins; bytes before its first frame
+RRD_FRAME, RRD_FOOTER = struct.Struct("<QQ"), 0  # kind and length of a frame; the kind after the last message
+
+
+class RunViewer:
+    """Writes run.rrd.
+
+    Args:
+        path: File to write; its folder must exist.
+        model: Drawn and moved by EpisodeView.qpos; None for a robot without a model.
+        control_dt: [s] between two steps.
+        layout: Camera, sizes and views.
+        resume: Go on with a file that is there, which a killed run may have left unfinished.
+
+    Raises:
+        FileExistsError: If the file is there and resume is False.
+        OSError: If the file cannot be written; also from episode(), metrics(), value_map() and close().
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        model: mujoco.MjModel | None,
+        *,
+        control_dt: float,
+        layout: Layout = Layout(),  # noqa: B008  # immutable
+        resume: bool = False,
+    ) -> None:
+        self.path = Path(path)
+        self._model, self._layout = model, layout
+        self._step, self._episode = 0, 0
+        aside = self.path.with_suffix(".earlier.rrd")
+        chunks = _set_aside(self.path, aside) if resume else []
+        # Rerun's own file sink may wait forever on a full disk, so the bytes are taken from memory and written here.
+        self._file = self.path.open("xb", buffering=0)
+        self._blueprint = blueprint(model, layout, control_dt)
+        self._start()
+        self._robot = RobotView(self._recording, model, "world/robot") if model is not None else None
+        if chunks:
+            self._take_over(chunks)
+        else:
+            self._log_static()
+        self._flush()
+        aside.unlink(missing_ok=True)
+
+    @property
+    def env_step(self) -> int:
+        """Where the next episode starts on the timeline `env_step`."""
+        return self._step
+
+    def episode(self, data: EpisodeView) -> None:
+        """Add one episode.
+
+        Raises:
+            ValueError: If an array has another shape than EpisodeView says, or qpos comes without a model.
+        """
+        data.check()
+        rows, last = Rows(self._recording, self._step, self._episode), self._step + data.steps
+        if data.qpos is not None:
+            if self._robot is None:
+                raise ValueError("qpos given, but RunViewer has no model to move with it.")
+            self._robot.log_poses(rows.indexes(data.steps + 1), data.qpos)
+        log_episode(rows, data, self._layout)
+        self._at(last)
+        outcome = {True: "success", False: "no success", None: "ended"}[data.success]
+        total = "" if data.reward is None else f", return {float(np.sum(data.reward)):.2f}"
+        text = f"{self._episode}: {outcome}, {data.steps} steps{total}. {data.title}"
+        level = rr.TextLogLevel.WARN if data.success is False else rr.TextLogLevel.INFO
+        self._recording.log("episodes", rr.TextLog(text, level=level))
+        if data.success is not None:
+            self._recording.log("success", rr.Scalars(float(data.success)))
+        self._step, self._episode = last + 1, self._episode + 1
+        self._flush()
+
+    def metrics(self, step: int, values: Mapping[str, float]) -> None:
+        """Add scalars at `metrics/<name>`, at a position on the timeline `env_step` (RunViewer.env_step is now)."""
+        self._at(step)
+        for name, value in values.items():
+            self._recording.log(f"metrics/{name}", rr.Scalars(float(value)))
+        self._flush()
+
+    def value_map(
+        self,
+        name: str,
+        values: np.ndarray,
+        extent: tuple[float, float, float, float],
+        *,
+        marks: Mapping[str, tuple[float, float]] | None = None,
+        limits: tuple[float, float] | None = None,
+    ) -> None:
+        """Show a value over the end effector's x and y; a later map of the same name replaces it.
+
+        Args:
+            name: One of Layout.value_maps.
+            values: [G, G'], first index along x, second along y.
+            extent: x from, x to, y from, y to, [m].
+            marks: Named places to mark, such as where the object is, [m].
+            limits: Values of the first and last colour, to compare maps; None: from this map.
+
+        Raises:
+            ValueError: If the blueprint has no view of that name, or values is not a finite matrix.
+        """
+        if name not in self._layout.value_maps:
+            raise ValueError(f"No view for the value map {name!r}. The layout has {list(self._layout.value_maps)}.")
+        log_value_map(self._recording, f"value_map/{name}", values, extent, marks or {}, limits)
+        self._flush()
+
+    def close(self) -> None:
+        """Finish the file with its index; the viewer cannot be used afterwards."""
+        self._flush()
+        self._file.close()
+        self._recording.disconnect()
+        chunks = _chunks(self.path)
+        self._start()
+        self._recording.send_chunks(chunks)
+        write_whole(self.path, self._stream.read() or b"")
+        self._recording.disconnect()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _start(self) -> None:
+        """A recording in memory, which begins with the blueprint."""
+        self._recording = rr.RecordingStream("mpc_sgft")
+        self._recording.set_log_time_enabled(False)
+        self._stream = self._recording.binary_stream()
+        self._recording.send_blueprint(self._blueprint, make_active=False, make_default=True)
+
+    def _at(self, step: int) -> None:
+        self._recording.set_time("env_step", sequence=step)
+        self._recording.set_time("episode", sequence=self._episode)
+
+    def _log_static(self) -> None:
+        self._recording.send_recording_name("/".join(self.path.resolve().parts[-3:-1]))
+        self._recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        log_series_styles(self._recording)
+        self._at(0)
+        if self._robot is not None:
+            self._robot.log_shapes()
+
+    def _take_over(self, chunks: list[Chunk]) -> None:
+        """Send what an earlier file held and go on counting where it stopped."""
+        self._recording.send_chunks(chunks)
+        for chunk in chunks:
+            if chunk.entity_path == "/episodes":
+                batch = chunk.to_record_batch()
+                self._step = max(self._step, *(row + 1 for row in batch.column("env_step").to_pylist()))
+                self._episode = max(self._episode, *(row + 1 for row in batch.column("episode").to_pylist()))
+
+    def _flush(self) -> None:
+        """Put everything so far into the file."""
+        self._recording.reset_time()
+        new = self._stream.read() or b""  # a whole file: header, messages, footer
+        data = new[0 if self._file.tell() == 0 else RRD_HEADER : _end_of_messages(new)]
+        try:
+            while data:
+                data = data[self._file.write(data) :]
+        except OSError as error:
+            raise OSError(error.errno, error.strerror, str(self.path)) from error
+
+
+def _end_of_messages(data: bytes) -> int:
+    """Where the last whole message of a rerun file ends: before its footer, or before a half-written message."""
+    at = RRD_HEADER
+    while at + RRD_FRAME.size <= len(data):
+        kind, length = RRD_FRAME.unpack_from(data, at)
+        if kind == RRD_FOOTER or at + RRD_FRAME.size + length > len(data):
+            break
+        at += RRD_FRAME.size + length
+    return at
+
+
+def _set_aside(path: Path, aside: Path) -> list[Chunk]:
+    """Move the file of a resumed run to `aside` and return what it holds.
+
+    Raises:
+        OSError: If it is no rerun recording; it then stays where it was.
+    """
+    source = aside if aside.exists() else path  # aside is there if an earlier take-over was killed: it holds more
+    if not source.exists():
+        return []
+    chunks = _chunks(source)
+    if source == path:
+        path.rename(aside)
+    else:
+        path.unlink(missing_ok=True)
+    return chunks
+
+
+def _chunks(path: Path) -> list[Chunk]:
+    """What a file holds, without a half-written message at its end.
+
+    Raises:
+        OSError: If it is no rerun recording.
+    """
+    data = path.read_bytes()
+    if data[: len(RRD_MAGIC)] != RRD_MAGIC[: len(data)]:
+        raise OSError(f"{path} is no rerun recording: it starts with {data[:4]!r}. Move it away to resume.")
+    whole = _end_of_messages(data)
+    if whole <= RRD_HEADER:
+        return []
+    with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".*no footer.*")  # only `close` writes one
+        readable = Path(folder) / path.name
+        readable.write_bytes(data[:whole])
+        return RrdReader(readable).stream().to_chunks()

@@ -1,0 +1,151 @@
+"""The gate between what trains and what acts, and the command map that a few rollouts can teach."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from omegaconf import OmegaConf
+from tensordict import TensorDict
+
+from mpc_sgft.learning.agent import Agent
+from mpc_sgft.learning.transfer import Transfer, Verdict, clearly_better, open_loop_error
+from mpc_sgft.learning.world_model import WorldModel
+
+SIZES = {"obs_dim": 6, "action_dim": 2, "decode_dim": 3, "latent_dim": 16, "mlp_dim": 32, "enc_dim": 32, "num_q": 2}
+TRAIN = Path(__file__).resolve().parents[3] / "configs" / "train" / "default.yaml"
+MEMORY = {"memory_dim": 2, "action_dim": 1, "obs_dim": 6, "decode_dim": 2}
+
+
+def make_agent(sizes: dict | None = None, **changes) -> Agent:
+    torch.manual_seed(0)
+    numbers = {k: v for k, v in OmegaConf.load(TRAIN).agent.items() if k != "_target_"}
+    plain = {"anchor": 0.0, "command_map": False, "discount": 0.9}
+    return Agent(WorldModel(**(SIZES | (sizes or {}))), **(numbers | plain | changes))
+
+
+def rollout(model: WorldModel, steps: int = 12, seed: int = 0) -> TensorDict:
+    """An episode [T] of random observations."""
+    generator = torch.Generator().manual_seed(seed)
+    observation = torch.randn(steps + 1, model.obs_dim, generator=generator)
+    action = 2 * torch.rand(steps, model.action_dim, generator=generator) - 1
+    flags = {k: torch.zeros(steps, 1, dtype=torch.bool) for k in ("terminated", "truncated", "done", "invalid")}
+    following = {"observation": observation[1:], "reward": torch.zeros(steps, 1), **flags}
+    return TensorDict(
+        {
+            "observation": observation[:-1],
+            "action": action,
+            "episode": torch.full((steps,), seed),
+            "step": torch.arange(steps),
+            "next": TensorDict(following, [steps]),
+        },
+        [steps],
+    )
+
+
+def transfer(gate: bool = True, updates: int = 5, margin: float = 0.9, **changes) -> Transfer:
+    agent = make_agent(transfer_lr=1e-2, **changes)
+    agent.freeze_for_transfer("sgft", horizon=2)
+    numbers = {"capacity": 200, "slice_len": 2, "batch_size": 16, "seed": 0, "memory": 5}
+    return Transfer(agent, updates=updates, gate=gate, margin=margin, **numbers)
+
+
+def same(a: WorldModel, b: WorldModel) -> bool:
+    return all(torch.equal(x, y) for x, y in zip(a.parameters(), b.parameters(), strict=True))
+
+
+def test_nothing_acts_before_it_predicted_an_unseen_rollout_better():
+    t = transfer(updates=60)
+    data = rollout(t.pretrained)
+    t.learn(data)
+    assert same(t.acting, t.pretrained) and not same(t.agent.model, t.pretrained)
+    t.learn(data)  # the same world again: what was learned predicts it better
+    assert t.verdicts[-1].fine_tuned < 0.9 * t.verdicts[-1].pretrained
+    assert t.verdicts[-1].accepted and same(t.acting, t.agent.model)
+
+
+def test_the_gate_closes_again_when_predictions_get_worse():
+    t = transfer(updates=60)
+    for _ in range(2):
+        t.learn(rollout(t.pretrained))
+    assert t.verdicts[-1].accepted
+    t.margin = 0.0  # nothing is good enough any more
+    t.learn(rollout(t.pretrained))
+    assert same(t.acting, t.pretrained)
+
+
+@pytest.mark.parametrize(("odd", "accepted"), [(3.0, True), (10.0, False)])
+def test_one_odd_rollout_does_not_shut_the_gate(odd, accepted):
+    """0.5^4 * 3 = 0.19 < 0.9^5 = 0.59 < 0.5^4 * 10, although the sums would say 5 > 0.9 * 5."""
+    verdicts = [Verdict(1.0, error, accepted=True) for error in (0.5, 0.5, 0.5, 0.5, odd)]
+    assert clearly_better(verdicts, margin=0.9) is accepted
+
+
+def test_without_the_gate_what_trains_acts_at_once():
+    t = transfer(gate=False)
+    t.learn(rollout(t.pretrained))
+    assert same(t.acting, t.agent.model) and not same(t.acting, t.pretrained)
+
+
+def test_a_saved_transfer_goes_on_with_the_same_numbers():
+    once, twice = transfer(), transfer()
+    for t in (once, twice):
+        t.learn(rollout(t.pretrained, seed=1))
+    again = transfer()
+    again.load_state_dict(twice.state_dict())
+    once.learn(rollout(once.pretrained, seed=2))
+    again.learn(rollout(again.pretrained, seed=2))
+    assert same(once.agent.model, again.agent.model) and once.verdicts == again.verdicts
+
+
+def test_open_loop_error_by_hand():
+    t = transfer()
+    data, model = rollout(t.pretrained, steps=4), t.pretrained
+    error = open_loop_error(model, data, 3)
+    z = model.encode(data["observation"][1:2])
+    for k in (1, 2):
+        z = model.next(z, data["action"][k : k + 1])
+    expected = (z - model.encode(data["next", "observation"][2:3])).square().mean()
+    assert torch.isclose(error[1, 1], expected)
+    assert error[3, 1:].isnan().all() and not error[:2].isnan().any()
+
+
+def test_the_latent_carries_past_commands_exactly():
+    model = WorldModel(**(SIZES | MEMORY))
+    observation = torch.randn(5, 6)
+    z = model.encode(observation)
+    assert torch.equal(z[:, -2:], observation[:, -2:])
+    action = torch.rand(5, 1)
+    assert torch.equal(model.next(z, action)[:, -2:], torch.cat([action, observation[:, -2:-1]], 1))
+
+
+def test_a_command_map_starts_as_the_identity_and_recovers_gain_and_delay():
+    torch.manual_seed(0)
+    model = WorldModel(**(SIZES | MEMORY))
+    truth = WorldModel(**(SIZES | MEMORY))
+    truth.load_state_dict(model.state_dict())
+    z, action = model.encode(torch.randn(256, 6)), 2 * torch.rand(256, 1) - 1
+    before = model.next(z, action)
+    model.add_command_map()
+    truth.add_command_map()
+    assert torch.equal(model.next(z, action), before)
+    with torch.no_grad():  # 0.3 of this command, 0.5 of the one before, and a drift
+        truth.dynamics.command.weight.copy_(torch.tensor([[0.3, 0.5, 0.0]]))
+        truth.dynamics.command.bias.fill_(0.1)
+        target = truth.next(z, action)
+    optimizer = torch.optim.Adam(model.dynamics.command.parameters(), lr=2e-2)
+    for _ in range(400):
+        loss = (model.next(z.detach(), action) - target).square().mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    assert torch.allclose(model.dynamics.command.weight, torch.tensor([[0.3, 0.5, 0.0]]), atol=0.02)
+    assert model.dynamics.command.bias.item() == pytest.approx(0.1, abs=0.02)
+
+
+def test_with_a_command_map_everything_else_stays_frozen():
+    agent = make_agent(sizes=MEMORY)
+    agent.freeze_for_transfer("sgft", horizon=2, command_map=True, anchor=0.1)
+    before, frozen = agent.model.dynamics.command.weight.clone(), agent.frozen_hash()
+    agent.update_transfer(rollout(agent.model, 6)[:4].unflatten(0, (2, 2)))
+    assert agent.frozen_hash() == frozen
+    assert not torch.equal(before, agent.model.dynamics.command.weight)

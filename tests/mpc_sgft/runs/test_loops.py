@@ -1,0 +1,199 @@
+"""The three commands as real processes, on the pendulum with tiny networks."""
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+from omegaconf import OmegaConf
+from safetensors.torch import load_file
+
+from mpc_sgft import deploy
+from mpc_sgft.command.errors import UserError
+from mpc_sgft.storage import checkpoint
+from mpc_sgft.storage.episode_file import read_episode
+from tools import relearn
+
+TINY = ["+experiment=debug", "task=pendulum", "log.tensorboard=false", "log.rerun=false"]
+NEEDED = "task gap method seed real_rollouts aborted_rollouts zero_shot_success final_success rollouts_to_90".split()
+NEEDED += ["wall_seconds", "rrd"]
+
+
+def command(name: str, *words: str) -> list[str]:
+    settings = [] if "--resume" in words else TINY  # a resumed run has its own
+    return [sys.executable, "-m", f"mpc_sgft.{name}", "--quiet", *settings, *words]
+
+
+def run(name: str, *words: str) -> subprocess.CompletedProcess:
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}
+    return subprocess.run(command(name, *words), capture_output=True, text=True, timeout=240, env=environment)
+
+
+def rows(folder: Path) -> list[dict]:
+    with (folder / "metrics.csv").open() as file:
+        return [
+            {k: v for k, v in row.items() if "seconds" not in k and k != "planner_ms"} for row in csv.DictReader(file)
+        ]
+
+
+@pytest.fixture(scope="module")
+def pretrained(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("runs") / "whole"
+    done = run("pretrain", f"run_dir={folder}")
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
+@pytest.fixture(scope="module")
+def deployed(pretrained, tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("runs") / "deployed"
+    done = run("deploy", f"checkpoint={pretrained}", "gap=pendulum_torque", f"run_dir={folder}", "rollouts=4")
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout.splitlines()[-1]) == json.loads((folder / "summary.json").read_text())
+    return folder
+
+
+def test_pretraining_resumes_with_the_same_numbers(pretrained, tmp_path):
+    half = tmp_path / "half"
+    assert run("pretrain", f"run_dir={half}", "transitions=960").returncode == 0
+    done = run("pretrain", "--resume", str(half), "transitions=1920")
+    assert done.returncode == 0, done.stderr
+    whole, resumed = (load_file(f / "checkpoint" / "model.safetensors") for f in (pretrained, half))
+    assert all((whole[k] == resumed[k]).all() for k in whole)
+    skip = {"success", "return"}  # the half run also evaluates at its own end
+    ours, theirs = rows(pretrained), rows(half)
+    assert [{k: v for k, v in r.items() if k not in skip} for r in ours] == [
+        {k: v for k, v in r.items() if k not in skip} for r in theirs
+    ]
+
+
+def test_ctrl_c_saves_and_says_how_to_go_on(tmp_path):
+    folder = tmp_path / "run"
+    process = subprocess.Popen(
+        command("pretrain", f"run_dir={folder}", "transitions=1000000"), stderr=subprocess.PIPE, text=True
+    )
+    wait_for(folder / "metrics.csv", process)
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert f"--resume {folder}" in err and (folder / "checkpoint" / "state.pt").exists()
+
+
+def test_the_summary_holds_what_scripts_read(deployed):
+    summary = json.loads((deployed / "summary.json").read_text())
+    assert set(NEEDED) <= set(summary)
+    assert summary["real_rollouts"] == 4 and summary["gap"] == "pendulum_torque"
+    assert len(list((deployed / "episodes").glob("*.mcap"))) == 4
+
+
+def test_deployment_freezes_what_it_must(pretrained, deployed):
+    before, after = (load_file(f / "checkpoint" / "model.safetensors") for f in (pretrained, deployed))
+    free = ("dynamics.", "policy_head.")
+    assert all((before[k] == after[k]).all() for k in before if not k.startswith(free))
+
+
+def test_the_simulation_policy_drives_the_warm_up_and_the_planner_the_rest(pretrained, tmp_path):
+    folder = tmp_path / "run"
+    words = ["gap=pendulum_torque", "rollouts=2", "warmup=1", "transfer.action_noise=0", "transfer.updates=0"]
+    done = run("deploy", f"checkpoint={pretrained}", f"run_dir={folder}", *words)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout.splitlines()[-1])["real_rollouts"] == 2  # a warm-up rollout counts like any other
+    model, _ = checkpoint.load(pretrained)
+    for number, by_policy in ((1, True), (2, False)):
+        episode = read_episode(folder / "episodes" / f"{number:04d}.mcap").transitions
+        with torch.no_grad():
+            wanted = model.policy_prior(model.encode(torch.as_tensor(episode["observation"]).float()), None)
+        assert torch.allclose(wanted, torch.as_tensor(episode["action"]).float(), atol=1e-4) is by_policy
+
+
+def test_a_killed_deployment_loses_at_most_the_step_in_flight(pretrained, tmp_path):
+    folder, words = tmp_path / "run", ["gap=pendulum_torque", "rollouts=3", "transfer.updates=2"]
+    process = subprocess.Popen(command("deploy", f"checkpoint={pretrained}", f"run_dir={folder}", *words))
+    second = folder / "episodes" / "0002.mcap"
+    wait_for(second, process)
+    deadline = time.monotonic() + 60
+    while len(read_episode(second).transitions.get("step", ())) < 5 and time.monotonic() < deadline:
+        time.sleep(0.001)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    kept = len(read_episode(second).transitions["step"])
+    assert kept >= 5
+    done = run("deploy", "--resume", str(folder))
+    assert done.returncode == 0, done.stderr
+    summary = json.loads((folder / "summary.json").read_text())
+    assert summary["real_rollouts"] == 3 and summary["aborted_rollouts"] <= 1
+    assert len(read_episode(second).transitions["step"]) == kept  # what happened is not driven again
+    assert read_episode(folder / "episodes" / "0003.mcap").complete
+
+
+def test_evaluate_reports_an_interval(pretrained, tmp_path):
+    done = run("evaluate", f"checkpoint={pretrained}", f"run_dir={tmp_path / 'e'}", "episodes=6")
+    assert done.returncode == 0, done.stderr
+    result = json.loads(done.stdout.splitlines()[-1])
+    low, high = result["success_interval"]
+    assert result["episodes"] == 6 and low <= result["success"] <= high
+
+
+def test_the_scripted_pendulum_swings_up(tmp_path):
+    done = run("evaluate", "policy=scripted", f"run_dir={tmp_path / 'e'}", "episodes=40")
+    assert json.loads(done.stdout.splitlines()[-1])["success"] >= 0.95
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["backend=franka"], "task=pendulum cannot run on the robot"),
+        (["checkpoint=nowhere"], "nowhere"),
+        (["task=push"], "task"),
+        (["gap.effects.actuator_gain.gain=99"], "-5"),
+        (["gap.effects.actuator_gain.gian=0.5"], "gain"),
+        (["planner.num_elites=100000"], "num_elites"),
+        (["model=5M"], "latent_dim"),
+    ],
+)
+def test_bad_input_is_one_clear_line(pretrained, tmp_path, capsys, words, says):
+    given = words if any(w.startswith("checkpoint") for w in words) else [f"checkpoint={pretrained}", *words]
+    assert deploy.main(["--quiet", *TINY, f"run_dir={tmp_path / 'r'}", *given]) == 2
+    err = capsys.readouterr().err
+    assert says in err and "Traceback" not in err
+
+
+def test_a_corrupt_checkpoint_is_named(pretrained, tmp_path, capsys):
+    bad = tmp_path / "bad.safetensors"
+    bad.write_bytes((pretrained / "checkpoint" / "model.safetensors").read_bytes()[:-100])
+    assert deploy.main(["--quiet", *TINY, f"checkpoint={bad}", f"run_dir={tmp_path / 'r'}"]) == 2
+    err = capsys.readouterr().err
+    assert "bad.safetensors" in err and "Traceback" not in err
+
+
+def wait_for(path: Path, process: subprocess.Popen, seconds: float = 120) -> None:
+    deadline = time.monotonic() + seconds
+    while not path.exists():
+        assert process.poll() is None, f"ended with {process.returncode} before {path.name} appeared"
+        assert time.monotonic() < deadline, f"{path} did not appear in {seconds} s"
+        time.sleep(0.01)
+
+
+def test_relearning_a_deployment_as_it_was_gives_what_it_learned(deployed):
+    cfg = relearn.config_of(deployed, [], seed=OmegaConf.load(deployed / "config.yaml").seed)
+    learned, success = relearn.relearn(cfg, relearn.rollouts_of(deployed), at=[4])
+    assert success == {4: json.loads((deployed / "summary.json").read_text())["final_success"]}
+    then = load_file(deployed / "checkpoint" / "model.safetensors")
+    now = learned.acting.state_dict()
+    assert then.keys() == now.keys() and all((then[k] == now[k]).all() for k in then)
+
+
+def test_relearning_takes_other_settings_and_refuses_unknown_ones(deployed, pretrained):
+    assert relearn.config_of(deployed, ["transfer.updates=7"], seed=1).transfer.updates == 7
+    with pytest.raises(UserError, match="updats"):
+        relearn.config_of(deployed, ["transfer.updats=7"], seed=1)
+    with pytest.raises(UserError, match="no deployment"):
+        relearn.config_of(pretrained, [], seed=1)
+    with pytest.raises(UserError, match="simulated gap"):
+        relearn.config_of(deployed, ["backend.name=franka"], seed=1)

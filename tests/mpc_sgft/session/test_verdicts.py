@@ -1,0 +1,119 @@
+"""What a person says of a rollout, in the real loop on the simulator: what counts, what is undone, what is recorded."""
+
+import csv
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from mpc_sgft.command import compose
+from mpc_sgft.runs import build
+from mpc_sgft.runs.deploy import Deployment
+from mpc_sgft.session.corrections import amend
+from mpc_sgft.session.operator import Nobody
+from mpc_sgft.storage.episode_file import EpisodeWriter, read_episode
+from mpc_sgft.storage.rollout import Press
+
+STEPS = 8
+SMALL = [f"task.env.episode_steps={STEPS}", "planner=policy", "transfer.updates=3", "eval_episodes=2", "quiet=true"]
+SMALL += ["log.tensorboard=false", "log.rerun=false", "train.replay.batch_size=8", "rollouts=2", "transfer.gate=false"]
+
+
+class Script:
+    """An operator whose keys are known beforehand: (phase, episode) -> words, each once; and answers to questions."""
+
+    present, stopping, guiding = True, False, False
+
+    def __init__(self, keys: dict[tuple[str, int], list[str]], answers: list[str] | None = None):
+        self.keys, self.answers, self.presses, self.episode = dict(keys), list(answers or ()), [], 0
+        nobody = Nobody()
+        self.rest, self.track, self.tell, self.halt = nobody.rest, nobody.track, nobody.tell, nobody.halt
+
+    def enter(self, phase: str, episode: int) -> None:
+        self.episode = episode
+        self.presses += [Press(word, 1e9, episode) for word in self.keys.pop((phase, episode), ())]
+
+    def poll(self) -> list[Press]:
+        taken, self.presses = self.presses, []
+        return taken
+
+    def ask(self) -> None:
+        self.presses.append(Press(self.answers.pop(0), 1e9, self.episode))
+
+
+def run(folder: Path, operator: Script | None, *more: str) -> dict:
+    cfg = compose.compose("deploy", [*SMALL, f"run_dir={folder}", *more], [])
+    agent, _ = build.load_agent(cfg)
+    return Deployment(cfg, agent, build.make_env(cfg, 1), build.make_env(cfg, 2), operator).loop()
+
+
+def rows(folder: Path, name: str) -> list[dict]:
+    with (folder / name).open() as file:
+        return [{k: v for k, v in row.items() if k not in ("planner_ms", "seconds")} for row in csv.DictReader(file)]
+
+
+def weights(folder: Path) -> dict[str, torch.Tensor]:
+    return load_file(folder / "checkpoint" / "model.safetensors")
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("runs") / "plain"
+    run(folder, None)
+    return folder
+
+
+@pytest.mark.parametrize("when", ["running", "resetting"])
+def test_a_rollout_driven_again_leaves_no_trace_in_what_was_learned(plain, tmp_path, when):
+    summary = run(tmp_path / "r", Script({(when, 1): ["rerecord"]}))
+    assert (summary["real_rollouts"], summary["rerecorded"]) == (2, 1)
+    names = sorted(p.name for p in (tmp_path / "r" / "episodes").iterdir())
+    assert names == ["0001.mcap", "0001.rerecorded1.mcap", "0002.mcap"]
+    aside = read_episode(tmp_path / "r" / "episodes" / "0001.rerecorded1.mcap")
+    assert aside.complete and [k["key"] for k in aside.keys] == ["rerecord"]
+    ours, theirs = weights(tmp_path / "r"), weights(plain)
+    assert all(torch.equal(ours[k], theirs[k]) for k in theirs)
+    for name in ("metrics.csv", "audit.csv"):
+        assert rows(tmp_path / "r", name) == rows(plain, name), name
+
+
+@pytest.mark.parametrize("when", ["training", "resetting"])
+def test_a_mark_overrides_what_the_task_computed(tmp_path, when):
+    operator = Script({(when, 1): ["failure", "success"]})
+    run(tmp_path / "r", operator)
+    marked, other = (read_episode(tmp_path / "r" / "episodes" / f"000{n}.mcap") for n in (1, 2))
+    assert marked.outcome["success"] is True and marked.outcome["task_success"] is False
+    assert [k["key"] for k in marked.keys] == ["failure", "success"] and len(marked.transitions["step"]) == STEPS
+    assert other.outcome["success"] is False and not other.keys
+    assert [row["real_success"] for row in rows(tmp_path / "r", "metrics.csv")] == ["1.0", "0.0"]
+
+
+def test_a_person_is_asked_after_each_episode(tmp_path):
+    operator = Script({}, ["success", "rerecord", "failure"])
+    summary = run(tmp_path / "r", operator, "success=ask")
+    assert not operator.answers and summary["rerecorded"] == 1
+    assert [row["real_success"] for row in rows(tmp_path / "r", "metrics.csv")] == ["1.0", "0.0"]
+    assert json.loads((tmp_path / "r" / "summary.json").read_text()) == summary
+
+
+def test_an_episode_that_was_cut_off_is_amended_with_what_was_lost(plain, tmp_path):
+    whole = (plain / "episodes" / "0001.mcap").read_bytes()
+    path = tmp_path / "0001.mcap"
+    path.write_bytes(whole[: len(whole) // 2])
+    before = read_episode(path)
+    amend(path, [Press("failure", before.metadata["began_unix"] + 2.5, 1)], False)
+    after = read_episode(path)
+    assert after.complete and after.outcome["aborted"] == "cut off" and after.outcome["lost"] == before.lost
+    assert after.keys[0]["time"] == 2.5 and list(tmp_path.iterdir()) == [path]
+    assert len(after.transitions["step"]) == len(before.transitions["step"]) > 0
+
+
+def test_what_a_person_moved_is_read_back(tmp_path):
+    with EpisodeWriter(tmp_path / "0.mcap", {}) as writer:
+        for k in range(2):
+            writer.guided({"time": [k, k + 0.5], "object": [[0.0, 1.0, float("nan")]] * 2})
+        writer.close({})
+    found = read_episode(tmp_path / "0.mcap").guided
+    assert found["time"].tolist() == [0, 0.5, 1, 1.5] and found["object"].shape == (4, 3)
