@@ -89,6 +89,8 @@ def test_groups_and_effects_are_the_files_on_disk() -> None:
         (["+foo=1"], ["unknown override 'foo'"]),
         (["horzon=8"], ["unknown override 'horzon'", "Did you mean 'horizon'"]),
         (["planner.horizn=8"], ["unknown key of planner 'horizn'", "Did you mean 'horizon'"]),
+        (["transfer.updates=5"], ["transfer.updates is called method.updates now: method.updates=5"]),
+        (["train.agent.transfer_lr=1"], ["method.lr=1"]),
         (["method=sgtf"], ["unknown method 'sgtf'", "sgft", "zero_shot"]),
         (["device=gpu"], ["unknown device 'gpu'", "cuda"]),
         (["seed=one"], ["a number is needed"]),

@@ -1,6 +1,6 @@
 """What other settings would have learned from the rollouts of a deployment, without driving them again.
 
-    python -m tools.relearn relearn.csv runs/push/latest --at 20 30 --set train.agent.transfer_entropy_coef=0.01
+    python -m tools.relearn relearn.csv runs/push/latest --at 20 30 --set method.entropy_coef=0.01
 
 The recorded rollouts are learned from one after the other, as `deploy` does, and the agent is evaluated in the run's
 gap after each number of them in --at. What a setting would have done to the rollouts themselves does not show: confirm
@@ -40,8 +40,8 @@ def config_of(run: Path, settings: list[str], seed: int) -> DictConfig:
         raise UserError(f"{run} holds no config.yaml. Give the run folder of a deployment.")
     cfg = OmegaConf.load(path)
     assert isinstance(cfg, DictConfig)
-    if "transfer" not in cfg:
-        raise UserError(f"{run} is no deployment: its config.yaml has no `transfer`.")
+    if "method" not in cfg:
+        raise UserError(f"{run} is no deployment: its config.yaml has no `method`.")
     OmegaConf.set_struct(cfg, True)
     try:
         cfg.merge_with_dotlist([*settings, f"seed={seed}"])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping, Sequence
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,13 @@ from mpc_sgft.command import choices
 from mpc_sgft.command.errors import UserError, unknown
 
 ALIASES = {"horizon": "planner.horizon", "robot-ip": "backend.robot_ip", "dry-run": "backend.dry_run"}
+RENAMED = {  # beginnings of overrides that had another name
+    "transfer.": "method.",
+    "train.agent.transfer_": "method.",
+    "train.agent.anchor": "method.anchor",
+    "train.agent.residual": "method.residual",
+    "train.agent.command_": "method.command_",
+}
 OPEN = ("gap.effects.", "randomize.")  # mappings that may gain keys on the command line
 FORM = re.compile(r"(?P<sign>\+\+|\+|~)?(?P<key>[A-Za-z_][\w./@-]*)(?P<rest>=.*)?", re.DOTALL)
 
@@ -48,12 +56,15 @@ def normalise(override: str) -> str:
     `horizon=8` sets the planner's horizon; effects of the gap and the experiment may be given with `+` or without.
 
     Raises:
-        UserError: If it is not of the form key=value.
+        UserError: If it is not of the form key=value, or has another name now.
     """
     form = FORM.fullmatch(override)
     if form is None or (form["rest"] is None and form["sign"] != "~"):
         raise UserError(f"cannot read {override!r}. Write overrides as key=value, e.g. seed=1; --help lists the names.")
     sign, key, rest = form["sign"] or "", form["key"], form["rest"] or ""
+    for old, new in RENAMED.items():
+        if key.startswith(old):
+            raise UserError(f"{key} is called {new}{key.removeprefix(old)} now: {new}{key.removeprefix(old)}{rest}")
     key = ALIASES.get(key, key)
     if sign != "~" and key.startswith(OPEN):
         sign = "++"
@@ -189,6 +200,12 @@ def resume(name: str, folder: str, overrides: Sequence[str], given: Sequence[str
     if not isinstance(cfg, DictConfig) or cfg.get("command") != name:
         wrote = cfg.get("command") if isinstance(cfg, DictConfig) else None
         raise UserError(f"cannot resume {folder} with {name}: {wrote or 'another program'} wrote it.")
+    moved = [target for target in _targets(cfg) if find_spec(target.rpartition(".")[0]) is None]
+    if moved:
+        raise UserError(
+            f"cannot resume {folder}: an earlier version wrote it ({moved[0]} has moved since). "
+            "Go on with that version; versions.json there names its commit."
+        )
     for override in parse(overrides):
         key = override.key_or_group
         if (
@@ -254,6 +271,15 @@ def _literal(value: Any) -> str:
     if isinstance(value, str):
         return "'" + value.replace("'", "\\'") + "'"
     return json.dumps(value)
+
+
+def _targets(node: Any) -> list[str]:
+    """Our own classes and functions that a saved config names."""
+    if isinstance(node, DictConfig):
+        here = node.get("_target_")
+        inner = [target for key in node if not OmegaConf.is_missing(node, key) for target in _targets(node[key])]
+        return [here, *inner] if isinstance(here, str) and here.startswith("mpc_sgft.") else inner
+    return []
 
 
 def _values(override: Override) -> list[str]:

@@ -1,4 +1,4 @@
-"""World model + optimisers: update() in pretraining, update_transfer() on real data."""
+"""World model + optimisers: update() is the TD-MPC2 objective, fit_dynamics() and climb() are what methods add."""
 
 import copy
 import hashlib
@@ -11,15 +11,11 @@ from torch import Tensor
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from mpc_sgft.learning import losses
-from mpc_sgft.learning.slices import check_finite, to_slices
+from mpc_sgft.learning.slices import Slices, check_finite, to_slices
 from mpc_sgft.learning.world_model import WorldModel
 
-METHODS = {  # the parts that train at transfer
-    "sgft": ("dynamics", "policy_head"),
-    "tdmpc2": ("encoder", "dynamics", "reward_head", "q_ensemble", "value_head", "policy_head", "decoder"),
-    "zero_shot": (),
-}
-PRETRAINED = METHODS["tdmpc2"]
+PRETRAINED = ("encoder", "dynamics", "reward_head", "q_ensemble", "value_head", "policy_head", "decoder")
+FOLLOWING = ("normalizer", "target_q")  # not by gradient
 
 
 class Agent:
@@ -29,7 +25,14 @@ class Agent:
         model: Trained in place.
         seed: Of the noise in the updates.
         device: Where model and batches live.
+        discount: Of the task, per control step.
+        rho: Weight of imagined step t is rho^t.
         others: configs/train/default.yaml, group `agent`.
+
+    Attributes:
+        pretraining: The normaliser and the averaged weights follow each update; False once a method took over.
+        imagined_steps: Of the policy's objective in pretraining; 0: it climbs the critics.
+        trainable: Parts of the model that updates may change; everything else is frozen.
     """
 
     def __init__(
@@ -53,13 +56,6 @@ class Agent:
         scale_rate: float,
         entropy_coef: float,
         entropy_lr: float,
-        transfer_lr: float,
-        transfer_policy_lr: float,
-        transfer_entropy_coef: float,
-        anchor: float,
-        residual: bool,
-        command_map: bool,
-        command_lr: float,
     ) -> None:
         if not 0 <= discount <= 1 or not 0 < rho <= 1:
             raise ValueError(f"discount must lie in [0, 1] and rho in (0, 1], got discount={discount}, rho={rho}.")
@@ -74,18 +70,13 @@ class Agent:
             "value_loss": value_weight,
             "decoder_loss": decoder_weight,
         }
-        self.transfer_lr, self.transfer_policy_lr = transfer_lr, transfer_policy_lr
-        self.transfer_entropy_coef, self.anchor, self.residual = transfer_entropy_coef, anchor, residual
-        self.command_map, self.command_lr = command_map, command_lr
         self.generator = torch.Generator(self.device).manual_seed(seed)
         self.scale = losses.RunningScale(scale_rate, self.device)
         self.log_entropy_coef = torch.tensor(entropy_coef, device=self.device).log().requires_grad_()
         self._averaged = AveragedModel(self.model, multi_avg_fn=get_ema_multi_avg_fn(average_decay))
-        self.method: str | None = None  # None while pretraining
-        self.horizon = 0  # imagined steps of the policy's objective; 0 in pretraining: it climbs the critics
-        self.trainable: tuple[str, ...] = (*PRETRAINED, "normalizer", "target_q")
-        self._anchored: list[Tensor] = []
-        self._make_optimizers(lr, lr)
+        self.pretraining, self.imagined_steps = True, 0
+        self.trainable: tuple[str, ...] = (*PRETRAINED, *FOLLOWING)
+        self._make_optimizers(lr, lr, lr)
 
     @property
     def averaged(self) -> WorldModel:
@@ -112,7 +103,7 @@ class Agent:
             FloatingPointError: If an entry of the batch or a loss is not finite; no parameter has been changed then.
         """
         model, data = self.model, to_slices(batch, self.device)
-        if self.method is None:
+        if self.pretraining:
             model.normalizer.update(data.observation[0])
         first_z = model.encode(data.observation[0])  # [B, D], trains the encoder
         with torch.no_grad():
@@ -148,13 +139,13 @@ class Agent:
         metrics["grad_norm"] = torch.nn.utils.clip_grad_norm_(self._model_parameters, self.grad_clip, foreach=True)
         self.model_optimizer.step()
 
-        imagine = self.method is None and self.horizon > 0
+        imagine = self.pretraining and self.imagined_steps > 0
         metrics |= self._update_policy_imagined(encoded[0]) if imagine else self._update_policy(zs.detach())
         model.update_targets(self.target_rate)
-        if self.method is None:
+        if self.pretraining:
             self._averaged.update_parameters(model)
         metrics["target_value"] = target_q.mean()
-        return _floats(metrics)
+        return floats(metrics)
 
     def _update_policy(self, zs: Tensor) -> dict[str, Tensor]:
         action, log_prob = self.model.policy(zs, self._noise(*zs.shape[:-1]))
@@ -163,19 +154,22 @@ class Agent:
         scale = self.scale.update(q.detach()[:, 0])
         coef = self.log_entropy_coef.detach().exp()
         loss = losses.over_time(losses.policy_loss(q, log_prob, coef, scale), self.rho)
-        return self._step_policy(loss, log_prob) | {"entropy_coef": coef, "scale": scale}
+        metrics = self._step_policy(loss, log_prob) | {"entropy_coef": coef, "scale": scale}
+        self._tune_entropy(log_prob)
+        return metrics
 
     def _update_policy_imagined(self, starts: Tensor) -> dict[str, Tensor]:
         coef = self.log_entropy_coef.detach().exp()
-        return self._climb(starts, coef) | {"entropy_coef": coef}
+        metrics, log_prob = self._climb(starts, self.imagined_steps, coef)
+        self._tune_entropy(log_prob)
+        return metrics | {"entropy_coef": coef}
 
-    def _climb(self, starts: Tensor, coef: Tensor | float) -> dict[str, Tensor]:
-        """A step of the policy up the SGFT objective of imagined steps from latents [B, D]."""
-        noise = self._noise(self.horizon, len(starts))
+    def _climb(self, starts: Tensor, horizon: int, coef: Tensor | float) -> tuple[dict[str, Tensor], Tensor]:
+        noise = self._noise(horizon, len(starts))
         objective, log_prob = losses.imagined_objective(self.model, starts, noise, self.discount)
         scale = self.scale.update(objective.detach())
         metrics = self._step_policy(coef * log_prob.mean() - objective.mean() / scale, log_prob)
-        return metrics | {"objective": objective.mean(), "scale": scale}
+        return metrics | {"objective": objective.mean(), "scale": scale}, log_prob
 
     def _step_policy(self, loss: Tensor, log_prob: Tensor) -> dict[str, Tensor]:
         check_finite({"policy_loss": loss})
@@ -184,103 +178,87 @@ class Agent:
         loss.backward(inputs=parameters)  # the critics and the dynamics collect no gradient here
         torch.nn.utils.clip_grad_norm_(parameters, self.grad_clip, foreach=True)
         self.policy_optimizer.step()
-        if self.entropy_lr and self.method != "sgft":
+        return {"policy_loss": loss, "entropy": -log_prob.mean()}
+
+    def _tune_entropy(self, log_prob: Tensor) -> None:
+        if self.entropy_lr:
             self.entropy_optimizer.zero_grad()
             losses.entropy_coef_loss(self.log_entropy_coef, log_prob, -float(self.model.action_dim)).backward()
             self.entropy_optimizer.step()
-        return {"policy_loss": loss, "entropy": -log_prob.mean()}
 
-    # -- learning on real data -----------------------------------------------------------------------------------------
+    # -- what methods of deployment use --------------------------------------------------------------------------------
 
-    def freeze_for_transfer(
+    def train_only(
         self,
-        method: str,
+        parts: tuple[str, ...],
         *,
-        horizon: int = 4,
-        anchor: float | None = None,
-        residual: bool | None = None,
-        command_map: bool | None = None,
-        rho: float | None = None,
+        lr: float,
+        policy_lr: float,
+        command_lr: float | None = None,
+        following: tuple[str, ...] = (),
     ) -> None:
-        """Freeze everything but what `method` trains, and start fresh optimisers.
+        """End pretraining: freeze everything but some parts, and start fresh optimisers.
 
         Args:
-            method: sgft | tdmpc2 | zero_shot.
-            horizon: Imagined steps of the policy's SGFT objective [H].
-            anchor: Weight of the squared distance of the dynamics' parameters from the pretrained ones beside their
-                consistency loss; None: as configured.
-            residual: Train a correction on top of frozen pretrained dynamics; None: as configured.
-            command_map: Also learn what the machine makes of a command, a few numbers that hold everywhere; None: as
-                configured.
-            rho: Decay of the dynamics loss per imagined step; None: as configured.
-
-        Raises:
-            ValueError: If the method is unknown or the horizon is not positive.
+            parts: Of the model, dotted names such as `dynamics.residual`; they train by gradient.
+            lr: Of Adam for these; the encoder takes its share of it.
+            policy_lr: Of Adam for the policy prior.
+            command_lr: Of Adam for the command map of the dynamics; None: lr.
+            following: Parts that updates change without a gradient.
         """
-        if method not in METHODS:
-            raise ValueError(f"No transfer method {method!r}. Available: {', '.join(METHODS)}.")
-        if horizon < 1:
-            raise ValueError(f"horizon={horizon} must be at least one control step.")
-        self.method, self.horizon = method, horizon
-        self.anchor = self.anchor if anchor is None else anchor
-        self.residual = self.residual if residual is None else residual
-        self.command_map = self.command_map if command_map is None else command_map
-        self.rho = self.rho if rho is None else rho
-        self.trainable = (*METHODS[method], "target_q") if method == "tdmpc2" else METHODS[method]
-        model = self.model
-        model.requires_grad_(False)
-        for part in METHODS[method]:
-            getattr(model, part).requires_grad_(True)
-        if self.residual and method == "sgft":
-            if model.dynamics.residual is None:
-                model.add_residual()
-            model.dynamics.base.requires_grad_(False)
-            self.trainable = ("dynamics.residual", "policy_head")
-        if self.command_map and method == "sgft":
-            if model.dynamics.command is None:
-                model.add_command_map()
-            self.trainable += ("dynamics.command",)
-        trained = [p for part in (model.dynamics.base, model.dynamics.residual) if part for p in part.parameters()]
-        self._anchored = [p.detach().clone() for p in trained if p.requires_grad]
-        if method == "tdmpc2":
-            self._make_optimizers(self.lr, self.lr)
-        elif method == "sgft":
-            self._make_optimizers(self.transfer_lr, self.transfer_policy_lr)
+        self.pretraining, self.trainable = False, (*parts, *following)
+        self.model.requires_grad_(False)
+        for part in parts:
+            self.model.get_submodule(part).requires_grad_(True)
+        if parts:
+            self._make_optimizers(lr, policy_lr, lr if command_lr is None else command_lr)
 
-    def update_transfer(self, batch: TensorDictBase, weight: Tensor | None = None) -> dict[str, float]:
-        """One step on slices [B, T] of any mixture of real and simulated data; returns metrics.
+    def dynamics_parameters(self) -> list[Tensor]:
+        """What trains of the dynamics, the command map left out."""
+        dynamics = self.model.dynamics
+        modules = (dynamics.base, dynamics.residual)
+        return [p for module in modules if module for p in module.parameters() if p.requires_grad]
+
+    def fit_dynamics(
+        self,
+        data: Slices,
+        *,
+        rho: float,
+        weight: Tensor | None = None,
+        penalty: tuple[str, float, Tensor] | None = None,
+    ) -> tuple[dict[str, Tensor], Tensor]:
+        """One step of the dynamics toward the encoded observations; encoder and observations stay as they are.
 
         Args:
-            batch: As from the buffer.
-            weight: Of each slice in the dynamics loss, [B], mean one; None weighs all alike. Only with method sgft.
+            data: Slices of T steps.
+            rho: Weight of imagined step t is rho^t.
+            weight: Of each slice, [B], mean one; None weighs all alike.
+            penalty: Name, weight and value of what is added to the loss.
+
+        Returns:
+            Metrics, and the encoded observations, [T + 1, B, D].
 
         Raises:
-            ValueError: If nothing trains (method zero_shot, or freeze_for_transfer was not called).
-            FloatingPointError: If an entry of the batch or a loss is not finite; that loss has changed nothing then.
+            FloatingPointError: If a loss is not finite; nothing has changed then.
         """
-        if self.method == "tdmpc2":
-            return self.update(batch)
-        if self.method != "sgft":
-            raise ValueError(
-                f"update_transfer needs freeze_for_transfer('sgft') or ('tdmpc2') first; method is {self.method!r}."
-            )
-        data = to_slices(batch, self.device)
         with torch.no_grad():
             encoded = self.model.encode(data.observation)  # [T + 1, B, D]
         zs = self._imagine(encoded[0], data.action)
-        loss = losses.over_time(losses.consistency_loss(zs[1:], encoded[1:]), self.rho, weight)
+        loss = losses.over_time(losses.consistency_loss(zs[1:], encoded[1:]), rho, weight)
         metrics = {"consistency_loss": loss}
-        if self.anchor:
-            moved = zip(self._model_parameters[-len(self._anchored) :], self._anchored, strict=True)
-            metrics["anchor_distance"] = torch.stack([(now - then).square().sum() for now, then in moved]).sum()
-            loss = loss + self.anchor * metrics["anchor_distance"]
+        if penalty is not None:
+            name, share, metrics[penalty[0]] = penalty
+            loss = loss + share * metrics[name]
         check_finite(metrics)
         self.model_optimizer.zero_grad()
         (self.weights["consistency_loss"] * loss).backward()
         metrics["grad_norm"] = torch.nn.utils.clip_grad_norm_(self._model_parameters, self.grad_clip, foreach=True)
         self.model_optimizer.step()
+        return metrics, encoded
 
-        return _floats(metrics | self._climb(encoded[0], self.transfer_entropy_coef))
+    def climb(self, starts: Tensor, *, horizon: int, entropy_coef: float) -> dict[str, Tensor]:
+        """A step of the policy prior up the SGFT objective of `horizon` imagined steps from latents [B, D]."""
+        return self._climb(starts, horizon, entropy_coef)[0]
 
     @torch.no_grad()
     def model_error(self, batch: TensorDictBase) -> Tensor:
@@ -319,36 +297,36 @@ class Agent:
 
     def state_dict(self) -> dict[str, Any]:
         """Everything needed to go on with the same numbers; the torch global generator (dropout) is included."""
-        names = ("method", "horizon", "anchor", "residual", "command_map", "rho")
-        transfer = {name: getattr(self, name) for name in names}
         return {
-            "transfer": transfer,
-            "anchored": [x.clone() for x in self._anchored],
+            "trainable": self.trainable,
             "model": {name: x.detach().clone() for name, x in self.model.state_dict().items()},
-            "averaged": self._averaged.state_dict() if self.method is None else None,
+            "averaged": self._averaged.state_dict() if self.pretraining else None,
             "snapshot": self.snapshot(),
             "generator": self.generator.get_state(),
             "torch_rng": torch.get_rng_state(),
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on from `state_dict` of an agent of the same sizes and numbers."""
-        if state["transfer"]["method"] is not None:
-            self.freeze_for_transfer(**state["transfer"])
+        """Go on from `state_dict` of an agent of the same sizes and numbers, in which the same parts train.
+
+        Raises:
+            ValueError: If others train there.
+        """
+        if tuple(state["trainable"]) != self.trainable:
+            raise ValueError(f"the saved agent trains {state['trainable']}, this one {self.trainable}")
         self.model.load_state_dict(state["model"])
         if state["averaged"] is not None:
             self._averaged.load_state_dict(state["averaged"])
-        self._anchored = [x.to(self.device) for x in state["anchored"]]
         self.restore(state["snapshot"])
         self.generator.set_state(state["generator"].cpu())
         torch.set_rng_state(state["torch_rng"].cpu())
 
     # -- helpers -------------------------------------------------------------------------------------------------------
 
-    def _make_optimizers(self, lr: float, policy_lr: float) -> None:
+    def _make_optimizers(self, lr: float, policy_lr: float, command_lr: float) -> None:
         model = self.model
         command = [] if model.dynamics.command is None else [*model.dynamics.command.parameters()]
-        groups = [{"params": command, "lr": self.command_lr}] if command else []
+        groups = [{"params": command, "lr": command_lr}] if command else []
         for part in PRETRAINED:
             parameters = [p for p in getattr(model, part).parameters() if p.requires_grad and part != "policy_head"]
             parameters = [p for p in parameters if all(p is not c for c in command)]
@@ -383,6 +361,7 @@ class Agent:
         return torch.randperm(self.model.num_q, generator=self.generator, device=self.device)[:2].tolist()
 
 
-def _floats(metrics: Mapping[str, Tensor]) -> dict[str, float]:
+def floats(metrics: Mapping[str, Tensor]) -> dict[str, float]:
+    """Scalars as Python numbers, in one transfer from the device."""
     values = torch.stack([m.detach().float() for m in metrics.values()]).tolist()
     return dict(zip(metrics, values, strict=True))

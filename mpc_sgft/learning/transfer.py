@@ -18,6 +18,7 @@ from tensordict import TensorDict
 
 from mpc_sgft.learning.agent import Agent
 from mpc_sgft.learning.buffer import make_buffer
+from mpc_sgft.learning.method import AbstractMethod
 from mpc_sgft.learning.world_model import WorldModel
 
 
@@ -33,33 +34,17 @@ class Transfer:
     """The agent that trains, the model that acts, and the gate between them.
 
     Args:
-        agent: Pretrained agent, already frozen for transfer.
+        agent: Pretrained agent; the method takes it over.
+        method: What trains, and how.
         capacity: Real transitions to hold.
-        slice_len, batch_size, seed: Of the replay slices.
-        updates: Gradient steps after each rollout.
-        gate: Whether fine-tuned parts must first predict unseen rollouts better; without, they act at once.
-        margin: They must lower the error to this share of the pretrained error, in the geometric mean over the last
-            `memory` rollouts: one odd rollout shuts nothing.
-        memory: Rollouts that the gate looks back on.
+        batch_size, seed: Of the replay slices.
     """
 
-    def __init__(
-        self,
-        agent: Agent,
-        *,
-        capacity: int,
-        slice_len: int,
-        batch_size: int,
-        seed: int,
-        updates: int,
-        gate: bool,
-        margin: float,
-        memory: int,
-    ):
-        self.agent, self.updates, self.gate, self.margin, self.memory = agent, updates, gate, margin, memory
-        self.slice_len, self.anchor = slice_len, agent.anchor
+    def __init__(self, agent: Agent, method: AbstractMethod, *, capacity: int, batch_size: int, seed: int):
+        self.agent, self.method, self.slice_len = agent, method, method.slice_len
+        method.take_over(agent)
         self._new_buffer = partial(
-            make_buffer, capacity=capacity, slice_len=slice_len, batch_size=batch_size, seed=seed
+            make_buffer, capacity=capacity, slice_len=method.slice_len, batch_size=batch_size, seed=seed
         )
         self.buffer = self._new_buffer()
         self.pretrained = copy.deepcopy(agent.model)
@@ -72,10 +57,11 @@ class Transfer:
             float(open_loop_error(model, steps, self.slice_len).nanmean())
             for model in (self.pretrained, self.agent.model)
         )
-        self.verdicts.append(Verdict(pretrained, fine_tuned, not self.gate))
-        recent = self.verdicts[1:][-self.memory :]  # at the first rollout the two are still the same
-        if self.gate and recent:
-            self.verdicts[-1] = self.verdicts[-1]._replace(accepted=clearly_better(recent, self.margin))
+        gate = self.method.gate
+        self.verdicts.append(Verdict(pretrained, fine_tuned, gate is None))
+        recent = self.verdicts[1:][-gate.memory :] if gate else []  # at the first rollout the two are still the same
+        if gate and recent:
+            self.verdicts[-1] = self.verdicts[-1]._replace(accepted=clearly_better(recent, gate.margin))
         return self.verdicts[-1]
 
     def learn(self, steps: TensorDict, track: Callable[[range], Iterable[int]] = iter) -> dict[str, float]:
@@ -87,16 +73,16 @@ class Transfer:
         """
         verdict = self.judge(steps)
         self.buffer.extend(steps)
-        self.agent.anchor = self.anchor / len(self.verdicts)  # a prior weighs less, the more data there are
         metrics: dict[str, float] = {}
-        for _ in track(range(self.updates)):
-            metrics = self.agent.update_transfer(self.buffer.sample())
+        for _ in track(range(self.method.updates)):
+            metrics = self.method.update(self.agent, self.buffer.sample(), rollouts=len(self.verdicts))
         self.acting.load_state_dict((self.agent.model if verdict.accepted else self.pretrained).state_dict())
         return metrics | {"error_pretrained": verdict.pretrained, "error_fine_tuned": verdict.fine_tuned}
 
     def state_dict(self) -> dict:
         return {
             "agent": self.agent.state_dict(),
+            "method": self.method.state_dict(),
             "buffer": self.buffer.state_dict(),
             "acting": self.acting.state_dict(),
             "verdicts": [tuple(v) for v in self.verdicts],
@@ -104,6 +90,7 @@ class Transfer:
 
     def load_state_dict(self, state: dict) -> None:
         self.agent.load_state_dict(state["agent"])
+        self.method.load_state_dict(state["method"])
         self.buffer = self._new_buffer()  # what is loaded may hold less than what is there
         self.buffer.load_state_dict(state["buffer"])
         self.acting.load_state_dict(state["acting"])

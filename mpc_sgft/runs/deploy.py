@@ -6,11 +6,12 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
+from hydra.utils import instantiate
 from omegaconf import DictConfig
 
 from envs.backends.base import BackendError
 from envs.env import ControlEnv
-from mpc_sgft.command.errors import Stopped, UserError, disk_error
+from mpc_sgft.command.errors import Stopped, UserError, disk_error, from_config
 from mpc_sgft.learning.agent import Agent
 from mpc_sgft.learning.audit import audit, write_audit
 from mpc_sgft.learning.transfer import Transfer, open_loop_error
@@ -60,20 +61,19 @@ def deploy(cfg: DictConfig) -> int:
 
 
 def make_transfer(cfg: DictConfig, agent: Agent, episode_steps: int) -> Transfer:
-    """Freeze a pretrained agent as `method` says, and what trains the rest of it."""
-    t, sgft = cfg.transfer, cfg.method == "sgft"
-    ours = {"anchor": t.anchor, "residual": t.residual, "command_map": t.command_map, "rho": t.rho}
-    agent.freeze_for_transfer(cfg.method, horizon=cfg.planner.horizon, **(ours if sgft else {}))
+    """A pretrained agent in the hands of `cfg.method`.
+
+    Raises:
+        UserError: For a number that the method refuses.
+    """
+    with from_config("method"):
+        method = instantiate(cfg.method, _convert_="all")
     return Transfer(
         agent,
+        method,
         capacity=(cfg.rollouts + 1) * episode_steps,
-        slice_len=t.slice_len if sgft else cfg.train.replay.slice_len,
         batch_size=cfg.train.replay.batch_size,
         seed=cfg.seed,
-        updates=t.updates if cfg.method != "zero_shot" else 0,
-        gate=t.gate and sgft,
-        margin=t.gate_margin,
-        memory=t.gate_memory,
     )
 
 
@@ -115,7 +115,7 @@ class Deployment:
             self.viewer.value_map("before", self.transfer.acting)
         hidden = cfg.quiet or self.operator.present  # the page shows the same
         done = self.state["rollouts"]
-        bar = progress(cfg.rollouts, initial=done, desc=f"deploy {cfg.method}", unit="rollout", disable=hidden)
+        bar = progress(cfg.rollouts, initial=done, desc=f"deploy {cfg.chosen.method}", unit="rollout", disable=hidden)
         self.show_counts()
         while self.state["rollouts"] < cfg.rollouts:
             number = self.state["rollouts"] + 1
@@ -200,7 +200,7 @@ class Deployment:
             path,
             number=number,
             seed=seed,
-            noise=cfg.transfer.action_noise,
+            noise=self.transfer.method.action_noise,
             candidate_steps=tuple(cfg.candidate_steps),
             operator=self.operator,
             state=state,
@@ -291,7 +291,7 @@ class Deployment:
         summary = {
             "task": cfg.chosen.task,
             "gap": cfg.chosen.gap,
-            "method": cfg.method,
+            "method": cfg.chosen.method,
             "seed": cfg.seed,
             "real_rollouts": self.state["rollouts"],
             "aborted_rollouts": self.state["aborted"],

@@ -29,7 +29,7 @@ def pretrain(cfg: DictConfig) -> int:
     env = build.make_env(cfg, cfg.num_envs, randomised=True, learning=True)
     judge = build.make_env(cfg, cfg.eval_episodes, randomised=True)
     agent = start_agent(cfg, env)
-    agent.horizon = cfg.imagined_steps
+    agent.imagined_steps = cfg.imagined_steps
     buffer = instantiate(cfg.train.replay, seed=cfg.seed)
     state = {"round": 0, "updates": 0, "transitions": 0, "episodes": 0, "seconds": 0.0, "streak": 0}
     saved = folder / "checkpoint" / "state.pt"

@@ -143,7 +143,7 @@ def make_operator(cfg: DictConfig) -> Operator:
         if asks(cfg):
             raise UserError("success=ask needs a person: --backend franka in a terminal, without --quiet or --dry-run.")
         return Nobody(quiet=cfg.quiet)
-    page = Page(title=f"{cfg.chosen.task} {cfg.method}", rollouts=cfg.rollouts, keys=KEYS)
+    page = Page(title=f"{cfg.chosen.task} {cfg.chosen.method}", rollouts=cfg.rollouts, keys=KEYS)
     return Person(page, sys.stdin.fileno())
 
 

@@ -7,8 +7,11 @@ import torch
 from tensordict import TensorDict
 from torch.testing import assert_close
 
-from mpc_sgft.learning.agent import METHODS, Agent
+from mpc_sgft.learning.agent import Agent
 from mpc_sgft.learning.world_model import PARTS, WorldModel
+from mpc_sgft.methods.sgft import SGFT
+from mpc_sgft.methods.tdmpc2 import TDMPC2
+from mpc_sgft.methods.zero_shot import ZeroShot
 
 SIZES = dict(obs_dim=6, action_dim=2, decode_dim=3, latent_dim=16, mlp_dim=32, enc_dim=32, num_q=2)
 NUMBERS = dict(
@@ -27,14 +30,23 @@ NUMBERS = dict(
     entropy_coef=0.01,
     average_decay=0.5,
     entropy_lr=1e-3,
-    transfer_lr=3e-4,
-    transfer_policy_lr=3e-4,
-    transfer_entropy_coef=1e-4,
-    anchor=0.0,
-    residual=False,
-    command_map=False,
-    command_lr=2e-2,
 )
+SHARED = dict(slice_len=3, action_noise=0.0)
+NO_GATE = dict(gate=False, gate_margin=0.9, gate_memory=5)
+OURS = dict(anchor=0.0, residual=False, command_map=False, command_lr=2e-2)
+SGFT_NUMBERS = dict(
+    horizon=4, lr=3e-4, policy_lr=3e-4, entropy_coef=1e-4, rho=0.5, updates=1, **SHARED, **NO_GATE, **OURS
+)
+
+
+def hand_over(agent: Agent, name: str = "sgft", **changes):
+    """Give an agent to a method; returns its update of a batch."""
+    if name == "sgft":
+        method = SGFT(**(SGFT_NUMBERS | changes))
+    else:
+        method = TDMPC2(updates=1, **SHARED) if name == "tdmpc2" else ZeroShot(**SHARED)
+    method.take_over(agent)
+    return lambda batch, weight=None: method.update(agent, batch, rollouts=1, weight=weight)
 
 
 def make_agent(sizes=None, **changes) -> Agent:
@@ -118,10 +130,10 @@ def test_truncated_steps_bootstrap_like_any_other():
 @pytest.mark.parametrize("residual", [False, True])
 def test_sgft_changes_dynamics_and_policy_and_no_frozen_bit(residual):
     agent = pretrained()
-    agent.freeze_for_transfer("sgft", residual=residual)
+    update = hand_over(agent, residual=residual)
     before, frozen = parts(agent), agent.frozen_hash()
     for i in range(3):
-        metrics = agent.update_transfer(make_batch(10 + i))
+        metrics = update(make_batch(10 + i))
     assert changed(before, parts(agent)) == {"dynamics", "policy_head"}
     assert agent.frozen_hash() == frozen
     assert {"consistency_loss", "policy_loss", "objective"} <= set(metrics)
@@ -133,7 +145,7 @@ def test_sgft_changes_dynamics_and_policy_and_no_frozen_bit(residual):
 
 def test_frozen_hash_notices_a_single_changed_entry():
     agent = pretrained()
-    agent.freeze_for_transfer("sgft")
+    hand_over(agent)
     frozen = agent.frozen_hash()
     with torch.no_grad():
         agent.model.normalizer.mean[0] += 1e-6
@@ -142,52 +154,51 @@ def test_frozen_hash_notices_a_single_changed_entry():
 
 def test_tdmpc2_trains_everything_but_the_normaliser():
     agent = pretrained()
-    agent.freeze_for_transfer("tdmpc2")
+    update = hand_over(agent, "tdmpc2")
     before, frozen = parts(agent), agent.frozen_hash()
     for i in range(3):
-        agent.update_transfer(make_batch(10 + i))
+        update(make_batch(10 + i))
     assert changed(before, parts(agent)) == set(PARTS) - {"normalizer"}
     assert agent.frozen_hash() == frozen
 
 
 def test_zero_shot_trains_nothing_and_says_so():
     agent = pretrained()
-    agent.freeze_for_transfer("zero_shot")
+    update, before = hand_over(agent, "zero_shot"), parts(agent)
     with pytest.raises(ValueError, match="zero_shot"):
-        agent.update_transfer(make_batch())
-    with pytest.raises(ValueError, match=", ".join(METHODS)):
-        agent.freeze_for_transfer("sgtf")
+        update(make_batch())
+    assert changed(before, parts(agent)) == set() and agent.trainable == ()
 
 
 def test_transfer_lowers_the_model_error_on_what_it_saw():
-    agent = pretrained(transfer_lr=3e-3)
-    agent.freeze_for_transfer("sgft")
+    agent = pretrained()
+    update = hand_over(agent, lr=3e-3)
     batch = make_batch(77, batch=16)
     before = agent.model_error(batch)
     for _ in range(150):
-        agent.update_transfer(batch)
+        update(batch)
     assert before.shape == (16, 3)
     assert agent.model_error(batch).mean() < 0.7 * before.mean()
 
 
 def test_slice_weights_choose_what_the_dynamics_learn():
-    agent = pretrained(transfer_lr=3e-3)
-    agent.freeze_for_transfer("sgft")
+    agent = pretrained()
+    update = hand_over(agent, lr=3e-3)
     batch, weight = make_batch(77, batch=16), torch.tensor([2.0, 0.0]).repeat(8)
     before = agent.model_error(batch)
     for _ in range(150):
-        agent.update_transfer(batch, weight)
+        update(batch, weight)
     ratio = agent.model_error(batch).mean(1) / before.mean(1)
     assert ratio[::2].mean() < ratio[1::2].mean() - 0.1
 
 
 def test_anchor_keeps_the_dynamics_near_the_pretrained_ones():
     def distance(anchor):
-        agent = pretrained(transfer_lr=3e-3)
-        agent.freeze_for_transfer("sgft", anchor=anchor)
+        agent = pretrained()
+        update = hand_over(agent, lr=3e-3, anchor=anchor)
         before = parts(agent)["dynamics"]
         for i in range(30):
-            agent.update_transfer(make_batch(i))
+            update(make_batch(i))
         return sum((v - before[k]).square().sum() for k, v in parts(agent)["dynamics"].items())
 
     assert distance(1.0) < 0.2 * distance(0.0)
@@ -195,30 +206,32 @@ def test_anchor_keeps_the_dynamics_near_the_pretrained_ones():
 
 def test_snapshot_and_restore_undo_updates_and_go_on_alike():
     agent = pretrained()
-    agent.freeze_for_transfer("sgft")
-    agent.update_transfer(make_batch(1))
+    update = hand_over(agent)
+    update(make_batch(1))
     snapshot, noise = agent.snapshot(), agent.generator.get_state()
-    first = [agent.update_transfer(make_batch(i)) for i in (2, 3)]
+    first = [update(make_batch(i)) for i in (2, 3)]
     after = parts(agent)
     agent.restore(snapshot)
     assert changed(after, parts(agent)) == {"dynamics", "policy_head"}
     agent.generator.set_state(noise)
-    assert [agent.update_transfer(make_batch(i)) for i in (2, 3)] == first
+    assert [update(make_batch(i)) for i in (2, 3)] == first
 
 
 @pytest.mark.parametrize("method", [None, "sgft", "tdmpc2", "residual"])
 def test_resume_gives_the_same_numbers(method):
+    def begin(agent):
+        if method is None:
+            return agent.update
+        return hand_over(agent, "sgft", horizon=2, residual=True) if method == "residual" else hand_over(agent, method)
+
     agent = pretrained()
-    if method:
-        method_name = "sgft" if method == "residual" else method
-        agent.freeze_for_transfer(method_name, horizon=2, anchor=0.1, residual=method == "residual")
-    update = agent.update_transfer if method else agent.update
+    update = begin(agent)
     update(make_batch(20))
     state = agent.state_dict()
     expected = [update(make_batch(i)) for i in (21, 22)]
     twin = make_agent()
+    again = begin(twin)
     twin.load_state_dict(state)
-    again = twin.update_transfer if method else twin.update
     assert [again(make_batch(i)) for i in (21, 22)] == expected
     assert changed(parts(agent), parts(twin)) == set()
 
@@ -261,13 +274,12 @@ def test_value_and_decoder_never_train_the_encoder():
 @pytest.mark.parametrize("name", ["observation", "action", "reward"])
 def test_a_batch_that_is_not_finite_is_named_and_changes_nothing(transfer, name):
     agent, batch = pretrained(), make_batch()
-    if transfer:
-        agent.freeze_for_transfer("sgft")
+    update = hand_over(agent) if transfer else agent.update
     place = batch["action"] if name == "action" else batch["next", name]
     place[1, -1, 0] = torch.nan
     before = parts(agent)
     with pytest.raises(FloatingPointError, match=f"^{name} is not finite"):
-        (agent.update_transfer if transfer else agent.update)(batch)
+        update(batch)
     assert changed(before, parts(agent)) == set()
 
 
@@ -300,7 +312,7 @@ def test_while_the_value_is_held_encoder_and_value_head_stay_and_all_else_learns
 def test_with_imagined_steps_the_policy_does_not_climb_the_critics(steps):
     plain, other = make_agent(), make_agent()
     for agent in (plain, other):
-        agent.horizon = steps
+        agent.imagined_steps = steps
     with torch.no_grad():
         for p in other.model.q_ensemble.parameters():
             p.normal_()

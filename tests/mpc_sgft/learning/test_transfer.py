@@ -8,19 +8,26 @@ from omegaconf import OmegaConf
 from tensordict import TensorDict
 
 from mpc_sgft.learning.agent import Agent
+from mpc_sgft.learning.method import Gate
 from mpc_sgft.learning.transfer import Transfer, Verdict, clearly_better, open_loop_error
 from mpc_sgft.learning.world_model import WorldModel
+from mpc_sgft.methods.sgft import SGFT
 
 SIZES = {"obs_dim": 6, "action_dim": 2, "decode_dim": 3, "latent_dim": 16, "mlp_dim": 32, "enc_dim": 32, "num_q": 2}
-TRAIN = Path(__file__).resolve().parents[3] / "configs" / "train" / "default.yaml"
+CONFIGS = Path(__file__).resolve().parents[3] / "configs"
 MEMORY = {"memory_dim": 2, "action_dim": 1, "obs_dim": 6, "decode_dim": 2}
 
 
 def make_agent(sizes: dict | None = None, **changes) -> Agent:
     torch.manual_seed(0)
-    numbers = {k: v for k, v in OmegaConf.load(TRAIN).agent.items() if k != "_target_"}
-    plain = {"anchor": 0.0, "command_map": False, "discount": 0.9}
-    return Agent(WorldModel(**(SIZES | (sizes or {}))), **(numbers | plain | changes))
+    numbers = {k: v for k, v in OmegaConf.load(CONFIGS / "train/default.yaml").agent.items() if k != "_target_"}
+    return Agent(WorldModel(**(SIZES | (sizes or {}))), **(numbers | {"discount": 0.9} | changes))
+
+
+def make_sgft(**changes) -> SGFT:
+    plain = {"horizon": 2, "anchor": 0.0, "command_map": False, "slice_len": 2}
+    numbers = OmegaConf.load(CONFIGS / "method/sgft.yaml")
+    return SGFT(**{k: (plain | changes).get(k, numbers._get_node(k)._value()) for k in numbers if k != "_target_"})
 
 
 def rollout(model: WorldModel, steps: int = 12, seed: int = 0) -> TensorDict:
@@ -43,10 +50,8 @@ def rollout(model: WorldModel, steps: int = 12, seed: int = 0) -> TensorDict:
 
 
 def transfer(gate: bool = True, updates: int = 5, margin: float = 0.9, **changes) -> Transfer:
-    agent = make_agent(transfer_lr=1e-2, **changes)
-    agent.freeze_for_transfer("sgft", horizon=2)
-    numbers = {"capacity": 200, "slice_len": 2, "batch_size": 16, "seed": 0, "memory": 5}
-    return Transfer(agent, updates=updates, gate=gate, margin=margin, **numbers)
+    method = make_sgft(lr=1e-2, gate=gate, updates=updates, gate_margin=margin)
+    return Transfer(make_agent(**changes), method, capacity=200, batch_size=16, seed=0)
 
 
 def same(a: WorldModel, b: WorldModel) -> bool:
@@ -68,7 +73,7 @@ def test_the_gate_closes_again_when_predictions_get_worse():
     for _ in range(2):
         t.learn(rollout(t.pretrained))
     assert t.verdicts[-1].accepted
-    t.margin = 0.0  # nothing is good enough any more
+    t.method.gate = Gate(margin=0.0, memory=5)  # nothing is good enough any more
     t.learn(rollout(t.pretrained))
     assert same(t.acting, t.pretrained)
 
@@ -144,8 +149,9 @@ def test_a_command_map_starts_as_the_identity_and_recovers_gain_and_delay():
 
 def test_with_a_command_map_everything_else_stays_frozen():
     agent = make_agent(sizes=MEMORY)
-    agent.freeze_for_transfer("sgft", horizon=2, command_map=True, anchor=0.1)
+    method = make_sgft(command_map=True, anchor=0.1)
+    method.take_over(agent)
     before, frozen = agent.model.dynamics.command.weight.clone(), agent.frozen_hash()
-    agent.update_transfer(rollout(agent.model, 6)[:4].unflatten(0, (2, 2)))
+    method.update(agent, rollout(agent.model, 6)[:4].unflatten(0, (2, 2)), rollouts=1)
     assert agent.frozen_hash() == frozen
     assert not torch.equal(before, agent.model.dynamics.command.weight)

@@ -100,7 +100,7 @@ def test_deployment_freezes_what_it_must(pretrained, deployed):
 
 def test_the_simulation_policy_drives_the_warm_up_and_the_planner_the_rest(pretrained, tmp_path):
     folder = tmp_path / "run"
-    words = ["gap=pendulum_torque", "rollouts=2", "warmup=1", "transfer.action_noise=0", "transfer.updates=0"]
+    words = ["gap=pendulum_torque", "rollouts=2", "warmup=1", "method.action_noise=0", "method.updates=0"]
     done = run("deploy", f"checkpoint={pretrained}", f"run_dir={folder}", *words)
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout.splitlines()[-1])["real_rollouts"] == 2  # a warm-up rollout counts like any other
@@ -113,7 +113,7 @@ def test_the_simulation_policy_drives_the_warm_up_and_the_planner_the_rest(pretr
 
 
 def test_a_killed_deployment_loses_at_most_the_step_in_flight(pretrained, tmp_path):
-    folder, words = tmp_path / "run", ["gap=pendulum_torque", "rollouts=3", "transfer.updates=2"]
+    folder, words = tmp_path / "run", ["gap=pendulum_torque", "rollouts=3", "method.updates=2"]
     process = subprocess.Popen(command("deploy", f"checkpoint={pretrained}", f"run_dir={folder}", *words))
     second = folder / "episodes" / "0002.mcap"
     wait_for(second, process)
@@ -190,9 +190,9 @@ def test_relearning_a_deployment_as_it_was_gives_what_it_learned(deployed):
 
 
 def test_relearning_takes_other_settings_and_refuses_unknown_ones(deployed, pretrained):
-    assert relearn.config_of(deployed, ["transfer.updates=7"], seed=1).transfer.updates == 7
+    assert relearn.config_of(deployed, ["method.updates=7"], seed=1).method.updates == 7
     with pytest.raises(UserError, match="updats"):
-        relearn.config_of(deployed, ["transfer.updats=7"], seed=1)
+        relearn.config_of(deployed, ["method.updats=7"], seed=1)
     with pytest.raises(UserError, match="no deployment"):
         relearn.config_of(pretrained, [], seed=1)
     with pytest.raises(UserError, match="simulated gap"):

@@ -26,7 +26,7 @@ pytest.importorskip("franky_sim", reason="needs pip install mpc_sgft[franka-sim]
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
 STEPS = 8
 PATIENT = ["backend.limits.state_age=5", "backend.limits.detection_age=5", "backend.patience=5"]  # on a busy computer
-ROBOT = ["--backend", "franka", "--robot-ip", "stand-in", "planner=policy", "transfer.updates=5", "rollouts=3"]
+ROBOT = ["--backend", "franka", "--robot-ip", "stand-in", "planner=policy", "method.updates=5", "rollouts=3"]
 ROBOT += [f"task.env.episode_steps={STEPS}", "log.rerun=false", "log.tensorboard=false", *PATIENT]
 
 

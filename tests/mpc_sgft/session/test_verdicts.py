@@ -17,8 +17,8 @@ from mpc_sgft.storage.episode_file import EpisodeWriter, read_episode
 from mpc_sgft.storage.rollout import Press
 
 STEPS = 8
-SMALL = [f"task.env.episode_steps={STEPS}", "planner=policy", "transfer.updates=3", "eval_episodes=2", "quiet=true"]
-SMALL += ["log.tensorboard=false", "log.rerun=false", "train.replay.batch_size=8", "rollouts=2", "transfer.gate=false"]
+SMALL = [f"task.env.episode_steps={STEPS}", "planner=policy", "method.updates=3", "eval_episodes=2", "quiet=true"]
+SMALL += ["log.tensorboard=false", "log.rerun=false", "train.replay.batch_size=8", "rollouts=2", "method.gate=false"]
 
 
 class Script:

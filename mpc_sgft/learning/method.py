@@ -1,0 +1,68 @@
+"""What a method of deployment must say; each file in mpc_sgft/methods/ is one."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from mpc_sgft.learning.agent import Agent
+
+
+class Gate(NamedTuple):
+    """When fine-tuned parts may act: once they predicted rollouts that nobody had trained on clearly better.
+
+    Attributes:
+        margin: They must lower the error to this share of the pretrained error, in the geometric mean over the last
+            `memory` rollouts: one odd rollout shuts nothing.
+        memory: Rollouts that the gate looks back on.
+    """
+
+    margin: float
+    memory: int
+
+
+class AbstractMethod(ABC):
+    """What `deploy method=NAME` freezes and what it learns from real rollouts.
+
+    configs/method/NAME.yaml names the class and holds its numbers. The planner is that of configs/planner/, on the
+    model that acts; a method that needs another one says so in its yaml (`defaults: [override /planner: NAME]`).
+
+    Attributes:
+        updates: Gradient steps after each rollout; 0 learns nothing.
+        slice_len: Consecutive steps of a slice of the replay [T].
+        action_noise: Standard deviation of the noise on real actions, action units.
+        gate: When fine-tuned parts may act; None: at once.
+    """
+
+    updates: int
+    slice_len: int
+    action_noise: float
+    gate: Gate | None = None
+
+    @abstractmethod
+    def take_over(self, agent: Agent) -> None:
+        """Freeze a pretrained agent but for what this method trains; called once, before the first rollout."""
+
+    @abstractmethod
+    def update(self, agent: Agent, batch: TensorDictBase, *, rollouts: int, weight: Tensor | None = None) -> dict:
+        """One step on slices [B, T] of real data; returns metrics, {name: float}.
+
+        Args:
+            agent: That this method took over.
+            batch: As from the buffer.
+            rollouts: How many there have been.
+            weight: Of each slice, [B], mean one; None weighs all alike.
+
+        Raises:
+            FloatingPointError: If an entry of the batch or a loss is not finite; that loss has changed nothing then.
+        """
+
+    def state_dict(self) -> dict[str, Any]:
+        """What must be kept to go on exactly, beside the agent's own state."""
+        return {}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on from `state_dict`, after `take_over`."""
+        assert not state, state

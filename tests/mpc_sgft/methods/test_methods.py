@@ -1,0 +1,80 @@
+"""A method is one file and one yaml; and each computes what it did when `Agent` held them all."""
+
+import copy
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from hydra.utils import instantiate
+from tensordict import TensorDict
+
+from mpc_sgft.command import choices, compose
+from mpc_sgft.learning.agent import Agent
+from mpc_sgft.learning.method import AbstractMethod
+from mpc_sgft.learning.transfer import Transfer
+from mpc_sgft.learning.world_model import WorldModel
+from mpc_sgft.runs.deploy import make_transfer
+
+SIZES = {"obs_dim": 6, "action_dim": 1, "decode_dim": 2, "memory_dim": 2, "latent_dim": 16, "mlp_dim": 32}
+SIZES |= {"enc_dim": 32, "num_q": 2}
+METHODS = choices.groups()["method"]
+# Written by the version in which Agent held every method, with the numbers below (commit 6d50529).
+AS_BEFORE = json.loads((Path(__file__).parent / "as_before.json").read_text())
+
+
+def rollout(seed: int, steps: int = 12) -> TensorDict:
+    """An episode [T] of random observations."""
+    generator = torch.Generator().manual_seed(seed)
+    observation = torch.randn(steps + 1, 6, generator=generator)
+    action = 2 * torch.rand(steps, 1, generator=generator) - 1
+    flags = {k: torch.zeros(steps, 1, dtype=torch.bool) for k in ("terminated", "truncated", "done", "invalid")}
+    following = TensorDict({"observation": observation[1:], "reward": torch.zeros(steps, 1), **flags}, [steps])
+    number = {"episode": torch.full((steps,), seed), "step": torch.arange(steps)}
+    return TensorDict({"observation": observation[:-1], "action": action, **number, "next": following}, [steps])
+
+
+def make(*overrides: str) -> Transfer:
+    given = ["train.replay.batch_size=16", *overrides]
+    cfg = compose.compose("deploy", [compose.normalise(text) for text in given], given)
+    torch.manual_seed(0)
+    agent: Agent = instantiate(cfg.train.agent, model=WorldModel(**SIZES), seed=0, device="cpu", discount=0.9)
+    return make_transfer(cfg, agent, 12)
+
+
+def test_every_file_is_a_method_and_every_method_has_its_numbers():
+    import mpc_sgft.methods
+
+    files = {p.stem for p in Path(mpc_sgft.methods.__file__).parent.glob("*.py")} - {"__init__"}
+    assert files == set(METHODS)
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_a_method_changes_what_it_says_and_nothing_else(name):
+    t = make(f"method={name}")
+    assert isinstance(t.method, AbstractMethod)
+    frozen, before = t.agent.frozen_hash(), {k: v.clone() for k, v in t.agent.model.state_dict().items()}
+    for seed in range(2):
+        t.learn(rollout(seed))
+    assert t.agent.frozen_hash() == frozen
+    moved = {k for k, v in t.agent.model.state_dict().items() if not torch.equal(v, before[k])}
+    for part in t.agent.trainable:
+        assert t.method.updates == 0 or any(k.startswith(part + ".") for k in moved), part
+    assert all(any(k.startswith(part + ".") for part in t.agent.trainable) for k in moved)
+    saved = copy.deepcopy(t.state_dict())
+    expected, again = t.learn(rollout(3)), make(f"method={name}")
+    again.load_state_dict(saved)
+    assert again.learn(rollout(3)) == expected
+
+
+@pytest.mark.parametrize("words", AS_BEFORE)
+def test_the_numbers_are_those_of_before(words):
+    """Another processor may round otherwise; the run on which these were written agrees to the last bit."""
+    name, *settings = words.split()
+    t = make(f"method={name}", "method.updates=10", *(s.replace("transfer.", "method.") for s in settings))
+    for seed, metrics in enumerate(AS_BEFORE[words]["metrics"]):
+        assert t.learn(rollout(seed)) == pytest.approx(metrics, rel=1e-3, abs=1e-5)
+    now, then = t.agent.model.state_dict(), t.pretrained.state_dict()
+    moved = {k: float((now[k] - then[k]).norm()) for k in sorted(now) if now[k].is_floating_point()}
+    assert {k: v for k, v in moved.items() if v} == pytest.approx(AS_BEFORE[words]["moved"], rel=1e-3)
+    assert [v.accepted for v in t.verdicts] == AS_BEFORE[words]["acting"]
