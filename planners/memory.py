@@ -11,7 +11,7 @@ def keep_freed_memory() -> bool:
     """Tell glibc's malloc not to hand freed memory back to the operating system; call once, at the start of a program.
 
     By default every large intermediate tensor is returned and fetched again page by page, which costs a plan 10-25 % of
-    its time on a CPU (tools/time_planner.py --default-malloc). The process then keeps its peak size.
+    its time on a CPU (tools/benchmarks/time_planner.py --default-malloc). The process then keeps its peak size.
 
     Returns:
         Whether it worked; False where the C library is another one, and nothing has changed then.

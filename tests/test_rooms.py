@@ -30,6 +30,14 @@ ROOMS = {  # of mpc_sgft, lowest first: each may import itself and what is named
     "runs": {"command", "learning", "methods", "storage", "session", "views"},
     "diagnose": {"command", "learning", "methods", "storage", "views", "runs"},
 }
+DIAGNOSE = {  # the rooms inside it, likewise; what stands beside them may import them all
+    "data": set(),
+    "simulation": {"data"},
+    "candidates": {"data", "simulation"},
+    "fitting": {"data", "simulation", "candidates"},
+    "verdict": {"data", "simulation", "candidates", "fitting"},
+    "deployments": {"data", "simulation", "candidates", "fitting", "verdict"},
+}
 
 
 def imported(source: str) -> set[str]:
@@ -88,6 +96,18 @@ def test_the_rooms_of_mpc_sgft_point_one_way() -> None:
         allowed = {room} | ROOMS[room] if room in ROOMS else {"command"}  # the entry points parse, then start a loop
         for other in others - {"mpc_sgft"}:
             if other.split(".")[1] not in allowed:
+                wrong.append(f"{name} imports {other}")
+    assert not wrong, wrong
+
+
+def test_the_rooms_of_diagnose_point_one_way() -> None:
+    wrong = []
+    for name, others in graph(("mpc_sgft",)).items():
+        room = name.split(".")[2] if name.startswith("mpc_sgft.diagnose.") else ""
+        for other in others if room in DIAGNOSE else ():
+            if other.startswith("mpc_sgft.diagnose") and other.split(".")[2:3] not in [
+                [r] for r in DIAGNOSE[room] | {room}
+            ]:
                 wrong.append(f"{name} imports {other}")
     assert not wrong, wrong
 

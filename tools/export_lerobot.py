@@ -37,8 +37,8 @@ from hydra.utils import instantiate
 
 from envs.task import AbstractTask
 from mpc_sgft.command.errors import UserError, disk_error, from_config
-from mpc_sgft.diagnose.deployment import joint_columns, run_config
-from mpc_sgft.diagnose.plant import SCALAR
+from mpc_sgft.diagnose.deployments.recordings import joint_columns, run_config
+from mpc_sgft.diagnose.simulation.plant import SCALAR
 from mpc_sgft.storage.episode_file import Episode, read_episode
 
 WRITER = Path(__file__).with_name("write_lerobot.py")

@@ -54,8 +54,8 @@ def diagnose(
     Raises:
         UserError: For data or a model that cannot be used; the message says what came and what to do.
     """
-    from mpc_sgft.diagnose.plant import load_plant
     from mpc_sgft.diagnose.run import read, run
+    from mpc_sgft.diagnose.simulation.plant import load_plant
 
     plant = load_plant(model)
     return run(

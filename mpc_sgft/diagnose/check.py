@@ -9,8 +9,8 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from mpc_sgft.command.errors import UserError
-from mpc_sgft.diagnose.plant import Axis
-from mpc_sgft.diagnose.record import MIN_SAMPLES, Array, Episode, Index, Table
+from mpc_sgft.diagnose.data.measured import MIN_SAMPLES, Array, Episode, Index, Table
+from mpc_sgft.diagnose.simulation.plant import Axis
 from mpc_sgft.diagnose.units import check_order, check_speeds, check_units
 
 KINDS = ("qpos", "qvel", "force", "sensor")

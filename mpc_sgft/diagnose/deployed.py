@@ -13,21 +13,21 @@ import numpy as np
 import yaml
 
 from envs.effects.base import Effect
-from mpc_sgft.diagnose.chain import Chain, Prediction, effects_of
+from mpc_sgft.diagnose.candidates.suspects import gap_of, suspects
 from mpc_sgft.diagnose.check import check_settings
-from mpc_sgft.diagnose.deployment import Deployment, read_deployment
-from mpc_sgft.diagnose.entry import Entry
-from mpc_sgft.diagnose.fit import fit
-from mpc_sgft.diagnose.motion import SUB
-from mpc_sgft.diagnose.name import Verdict, caution, judge_entries
-from mpc_sgft.diagnose.outlook import next_experiment
-from mpc_sgft.diagnose.prepare import Setup, cut, split
-from mpc_sgft.diagnose.record import Array
+from mpc_sgft.diagnose.data.measured import Array
+from mpc_sgft.diagnose.deployments.chain import Chain, Prediction, effects_of
+from mpc_sgft.diagnose.deployments.motion_link import SUB
+from mpc_sgft.diagnose.deployments.next_recording import next_experiment
+from mpc_sgft.diagnose.deployments.recordings import Deployment, read_deployment
+from mpc_sgft.diagnose.fitting.fit import fit
+from mpc_sgft.diagnose.fitting.hypothesis import Entry
+from mpc_sgft.diagnose.fitting.prepare import Setup, cut, split
+from mpc_sgft.diagnose.fitting.screen import Effort
+from mpc_sgft.diagnose.fitting.search import search
 from mpc_sgft.diagnose.report import Report
 from mpc_sgft.diagnose.run import candidate_rows, effect_rows, reduction
-from mpc_sgft.diagnose.screen import Effort
-from mpc_sgft.diagnose.search import search
-from mpc_sgft.diagnose.suspects import gap_of, suspects
+from mpc_sgft.diagnose.verdict.naming import Verdict, caution, judge_entries
 from mpc_sgft.storage.metrics import progress as bar_of
 
 LENGTH = 6  # control steps in a window

@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from mpc_sgft.diagnose.record import Array
-from mpc_sgft.diagnose.replay import Replayer
+from mpc_sgft.diagnose.data.measured import Array
+from mpc_sgft.diagnose.simulation.replay import Replayer
 
 MAX_CANDIDATES = 20
 

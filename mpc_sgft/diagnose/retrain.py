@@ -14,7 +14,7 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 from mpc_sgft.command.errors import UserError
-from mpc_sgft.diagnose.deployment import run_config
+from mpc_sgft.diagnose.deployments.recordings import run_config
 
 TARGET = 0.95  # success that counts as solved
 HELD = 3  # share of retraining, one in so many, that leaves encoder and V alone

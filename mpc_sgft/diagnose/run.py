@@ -11,24 +11,25 @@ import mujoco
 import numpy as np
 
 from mpc_sgft.command.errors import UserError
-from mpc_sgft.diagnose import judge, repair
+from mpc_sgft.diagnose.candidates.library import candidates, numbers, sums_of
+from mpc_sgft.diagnose.candidates.nominal import nominal_terms, refit_table
 from mpc_sgft.diagnose.check import check_settings, episodes
-from mpc_sgft.diagnose.entry import Entry
-from mpc_sgft.diagnose.experiment import next_experiment
-from mpc_sgft.diagnose.fit import Fit, Problem, change_of
-from mpc_sgft.diagnose.flexible import flexible_fit
-from mpc_sgft.diagnose.library import candidates, numbers, sums_of
-from mpc_sgft.diagnose.locate import locate
-from mpc_sgft.diagnose.name import Verdict, caution, effect_probability, intervals, judge_entries, settled
-from mpc_sgft.diagnose.name import choose as choose_set
-from mpc_sgft.diagnose.nominal import nominal_terms, refit_table
-from mpc_sgft.diagnose.plant import SHARP, Change, Plant
-from mpc_sgft.diagnose.prepare import Setup, around, prepare, scales
-from mpc_sgft.diagnose.record import Array, Episode, files, read_table
-from mpc_sgft.diagnose.replay import Replayer
+from mpc_sgft.diagnose.data.measured import Array, Episode, files, read_table
+from mpc_sgft.diagnose.fitting import judge
+from mpc_sgft.diagnose.fitting.fit import Fit, Problem, change_of
+from mpc_sgft.diagnose.fitting.flexible import flexible_fit
+from mpc_sgft.diagnose.fitting.hypothesis import Entry
+from mpc_sgft.diagnose.fitting.prepare import Setup, around, prepare, scales
+from mpc_sgft.diagnose.fitting.screen import key_of
+from mpc_sgft.diagnose.fitting.search import again, nearest, search
 from mpc_sgft.diagnose.report import MAX_CANDIDATES, Report
-from mpc_sgft.diagnose.screen import key_of
-from mpc_sgft.diagnose.search import again, nearest, search
+from mpc_sgft.diagnose.simulation.plant import SHARP, Change, Plant
+from mpc_sgft.diagnose.simulation.replay import Replayer
+from mpc_sgft.diagnose.verdict import repair
+from mpc_sgft.diagnose.verdict.locate import locate
+from mpc_sgft.diagnose.verdict.naming import Verdict, caution, effect_probability, intervals, judge_entries, settled
+from mpc_sgft.diagnose.verdict.naming import choose as choose_set
+from mpc_sgft.diagnose.verdict.next_experiment import next_experiment
 from mpc_sgft.storage.metrics import progress as bar_of
 
 STEPS = (4 * SHARP, 2 * SHARP, SHARP)  # [s] to simulate with: the longest whose error noise hides

@@ -10,8 +10,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from mpc_sgft.command.errors import UserError
-from mpc_sgft.diagnose.plant import Axis
-from mpc_sgft.diagnose.record import Array, Table
+from mpc_sgft.diagnose.data.measured import Array, Table
+from mpc_sgft.diagnose.simulation.plant import Axis
 
 BEYOND = 3.0  # times the model's range: no joint, stop or offset gets a reading there
 INSIDE = 1.1  # times the range, of readings in the right unit

@@ -2,7 +2,7 @@
 
 import copy
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, cast
 
 import torch
@@ -225,7 +225,7 @@ class Agent:
         *,
         rho: float,
         weight: Tensor | None = None,
-        penalty: tuple[str, float, Tensor] | None = None,
+        penalty: tuple[str, float, Callable[[], Tensor]] | None = None,
     ) -> tuple[dict[str, Tensor], Tensor]:
         """One step of the dynamics toward the encoded observations; encoder and observations stay as they are.
 
@@ -233,7 +233,7 @@ class Agent:
             data: Slices of T steps.
             rho: Weight of imagined step t is rho^t.
             weight: Of each slice, [B], mean one; None weighs all alike.
-            penalty: Name, weight and value of what is added to the loss.
+            penalty: Name, weight and value of what is added to the loss, worked out after it.
 
         Returns:
             Metrics, and the encoded observations, [T + 1, B, D].
@@ -247,7 +247,8 @@ class Agent:
         loss = losses.over_time(losses.consistency_loss(zs[1:], encoded[1:]), rho, weight)
         metrics = {"consistency_loss": loss}
         if penalty is not None:
-            name, share, metrics[penalty[0]] = penalty
+            name, share, value = penalty
+            metrics[name] = value()
             loss = loss + share * metrics[name]
         check_finite(metrics)
         self.model_optimizer.zero_grad()

@@ -85,11 +85,12 @@ class SGFT(AbstractMethod):
     def update(
         self, agent: Agent, batch: TensorDictBase, *, rollouts: int, weight: Tensor | None = None
     ) -> dict[str, float]:
-        data, penalty = to_slices(batch, agent.device), None
-        if self.anchor:
+        def distance() -> Tensor:
             moved = zip(agent.dynamics_parameters(), self._pretrained, strict=True)
-            distance = torch.stack([(now - then).square().sum() for now, then in moved]).sum()
-            penalty = ("anchor_distance", self.anchor / rollouts, distance)
+            return torch.stack([(now - then).square().sum() for now, then in moved]).sum()
+
+        data = to_slices(batch, agent.device)
+        penalty = ("anchor_distance", self.anchor / rollouts, distance) if self.anchor else None
         metrics, encoded = agent.fit_dynamics(data, rho=self.rho, weight=weight, penalty=penalty)
         return floats(metrics | agent.climb(encoded[0], horizon=self.horizon, entropy_coef=self.entropy_coef))
 

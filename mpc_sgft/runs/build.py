@@ -107,6 +107,7 @@ def load_agent(cfg: DictConfig) -> tuple[Agent, dict[str, Any]]:
                 f"{path} was trained with task.{name}={loaded.meta[name]}, this run has {cfg.task[name]}. "
                 f"Leave task.{name} out, or pretrain again."
             )
+    torch.manual_seed(cfg.seed)  # of dropout, and of what a method adds to the model
     with from_config("train"):
         agent = instantiate(
             cfg.train.agent, model=loaded.model, seed=cfg.seed, device=device(cfg), discount=cfg.task.discount

@@ -12,7 +12,7 @@ import yaml
 from envs.backends.sim import SimBackend
 from envs.effects import load
 from envs.tasks.push import Push
-from mpc_sgft.diagnose.record import write_csv
+from mpc_sgft.diagnose.data.measured import write_csv
 from mpc_sgft.storage.episode_file import EpisodeWriter
 
 SLIDE = """<mujoco><option timestep="0.002"/><worldbody><body name="cart">

@@ -11,7 +11,7 @@ import pytest
 
 from mpc_sgft.diagnose import diagnose
 from mpc_sgft.diagnose.__main__ import main
-from mpc_sgft.diagnose.record import write_csv
+from mpc_sgft.diagnose.data.measured import write_csv
 
 GEAR = 10.0  # of the slide's motor
 Record = Callable[..., Path]

@@ -14,8 +14,8 @@ from envs.effects import load
 from mpc_sgft.command.errors import UserError
 from mpc_sgft.diagnose.__main__ import main
 from mpc_sgft.diagnose.deployed import diagnose_run
-from mpc_sgft.diagnose.deployment import read_deployment
-from mpc_sgft.diagnose.drive import Commands, measured_drive
+from mpc_sgft.diagnose.deployments.command_link import Commands, measured_drive
+from mpc_sgft.diagnose.deployments.recordings import read_deployment
 from mpc_sgft.storage.episode_file import read_episode
 
 FEW = ["actuator_gain", "frame_rotation", "actuator_delay", "contact_friction"]

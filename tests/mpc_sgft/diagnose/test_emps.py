@@ -8,14 +8,14 @@ import mujoco
 import numpy as np
 import pytest
 
-from mpc_sgft.diagnose import judge
-from mpc_sgft.diagnose.entry import Entry, entry
-from mpc_sgft.diagnose.fit import change_of, fit
-from mpc_sgft.diagnose.library import make_term
-from mpc_sgft.diagnose.nominal import nominal_terms
-from mpc_sgft.diagnose.plant import Plant
-from mpc_sgft.diagnose.prepare import Setup, prepare, scales
-from tools import emps
+from mpc_sgft.diagnose.candidates.library import make_term
+from mpc_sgft.diagnose.candidates.nominal import nominal_terms
+from mpc_sgft.diagnose.fitting import judge
+from mpc_sgft.diagnose.fitting.fit import change_of, fit
+from mpc_sgft.diagnose.fitting.hypothesis import Entry, entry
+from mpc_sgft.diagnose.fitting.prepare import Setup, prepare, scales
+from mpc_sgft.diagnose.simulation.plant import Plant
+from tools.studies import emps
 
 
 def _problem(data_dir: Path) -> tuple[Plant, Setup]:

@@ -8,13 +8,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mpc_sgft.diagnose import judge
-from mpc_sgft.diagnose.entry import Entry, entry
-from mpc_sgft.diagnose.fit import Fit, by_parts, fit, left_out_errors
-from mpc_sgft.diagnose.library import Term
-from mpc_sgft.diagnose.name import distinct, odds
-from mpc_sgft.diagnose.plant import Change
-from mpc_sgft.diagnose.prepare import Setup, cut
+from mpc_sgft.diagnose.candidates.library import Term
+from mpc_sgft.diagnose.fitting import judge
+from mpc_sgft.diagnose.fitting.fit import Fit, by_parts, fit, left_out_errors
+from mpc_sgft.diagnose.fitting.hypothesis import Entry, entry
+from mpc_sgft.diagnose.fitting.prepare import Setup, cut
+from mpc_sgft.diagnose.simulation.plant import Change
+from mpc_sgft.diagnose.verdict.naming import distinct, odds
 
 SLOPE = Term(
     effect="slope",

@@ -11,14 +11,14 @@ import pytest
 
 from mpc_sgft.diagnose import diagnose
 from mpc_sgft.diagnose import run as running
-from mpc_sgft.diagnose import search as searching
+from mpc_sgft.diagnose.candidates.library import make_term
 from mpc_sgft.diagnose.check import episodes
-from mpc_sgft.diagnose.entry import Entry, entry
-from mpc_sgft.diagnose.fit import fit
-from mpc_sgft.diagnose.library import make_term
-from mpc_sgft.diagnose.plant import Plant, load_plant
-from mpc_sgft.diagnose.prepare import Problem, Setup, around, default_signals, prepare, scales
-from mpc_sgft.diagnose.record import Episode, read_table
+from mpc_sgft.diagnose.data.measured import Episode, read_table
+from mpc_sgft.diagnose.fitting import search as searching
+from mpc_sgft.diagnose.fitting.fit import fit
+from mpc_sgft.diagnose.fitting.hypothesis import Entry, entry
+from mpc_sgft.diagnose.fitting.prepare import Problem, Setup, around, default_signals, prepare, scales
+from mpc_sgft.diagnose.simulation.plant import Plant, load_plant
 
 
 @pytest.fixture

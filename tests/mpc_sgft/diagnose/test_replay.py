@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 
 from mpc_sgft.command.errors import UserError
-from mpc_sgft.diagnose.held import held_mean
-from mpc_sgft.diagnose.library import candidates, enrich, make_term
-from mpc_sgft.diagnose.plant import Change, Plant
-from mpc_sgft.diagnose.prepare import discrepancy, prepare, scales
-from mpc_sgft.diagnose.record import Episode
-from mpc_sgft.diagnose.replay import Replayer, _alike
-from mpc_sgft.diagnose.rub import Drive
-from mpc_sgft.diagnose.smooth import smooth
-from mpc_sgft.diagnose.table import TABLE, Scales
-from mpc_sgft.diagnose.windows import AFTER, BEFORE
+from mpc_sgft.diagnose.candidates.effect_table import TABLE, Scales
+from mpc_sgft.diagnose.candidates.library import candidates, enrich, make_term
+from mpc_sgft.diagnose.data.held_commands import held_mean
+from mpc_sgft.diagnose.data.measured import Episode
+from mpc_sgft.diagnose.data.smooth import smooth
+from mpc_sgft.diagnose.data.windows import AFTER, BEFORE
+from mpc_sgft.diagnose.fitting.prepare import discrepancy, prepare, scales
+from mpc_sgft.diagnose.simulation.load_friction import Drive
+from mpc_sgft.diagnose.simulation.plant import Change, Plant
+from mpc_sgft.diagnose.simulation.replay import Replayer, _alike
 
 SLIDE = """<mujoco><option timestep="0.002"/><worldbody><body name="cart"><joint name="x" type="slide" axis="1 0 0"/>
 <geom size="0.1" mass="2"/></body></worldbody><actuator><motor name="motor" joint="x"/></actuator></mujoco>"""

@@ -6,14 +6,14 @@ import mujoco
 import numpy as np
 import pytest
 
-from mpc_sgft.diagnose import screen as screening
-from mpc_sgft.diagnose.entry import entry
-from mpc_sgft.diagnose.fit import Fit, fit
-from mpc_sgft.diagnose.library import Term, candidates, enrich, includes, simplify
-from mpc_sgft.diagnose.plant import Change, Plant
-from mpc_sgft.diagnose.prepare import Setup
-from mpc_sgft.diagnose.screen import proposals, screen
-from mpc_sgft.diagnose.table import Scales
+from mpc_sgft.diagnose.candidates.effect_table import Scales
+from mpc_sgft.diagnose.candidates.library import Term, candidates, enrich, includes, simplify
+from mpc_sgft.diagnose.fitting import screen as screening
+from mpc_sgft.diagnose.fitting.fit import Fit, fit
+from mpc_sgft.diagnose.fitting.hypothesis import entry
+from mpc_sgft.diagnose.fitting.prepare import Setup
+from mpc_sgft.diagnose.fitting.screen import proposals, screen
+from mpc_sgft.diagnose.simulation.plant import Change, Plant
 
 TRUE = 2e-4  # of the typical size
 HINGE = """<mujoco><worldbody><body><joint name="hinge" axis="0 1 0"/><geom size="0.05" mass="1"/></body></worldbody>

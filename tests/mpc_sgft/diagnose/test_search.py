@@ -9,18 +9,18 @@ import mujoco
 import numpy as np
 import pytest
 
-from mpc_sgft.diagnose import screen as screening
-from mpc_sgft.diagnose import search as searching
-from mpc_sgft.diagnose.entry import Entry, entry
-from mpc_sgft.diagnose.fit import Fit, fit
-from mpc_sgft.diagnose.flexible import Flexible
-from mpc_sgft.diagnose.library import Term, as_gap, candidates, settings, simplify
-from mpc_sgft.diagnose.name import caution, gains, holds, judge_entries
-from mpc_sgft.diagnose.plant import Change, Plant
-from mpc_sgft.diagnose.prepare import NOISE, Setup
-from mpc_sgft.diagnose.screen import Effort
-from mpc_sgft.diagnose.search import no_worse, search, swaps
-from mpc_sgft.diagnose.table import Scales
+from mpc_sgft.diagnose.candidates.effect_table import Scales
+from mpc_sgft.diagnose.candidates.library import Term, as_gap, candidates, settings, simplify
+from mpc_sgft.diagnose.fitting import screen as screening
+from mpc_sgft.diagnose.fitting import search as searching
+from mpc_sgft.diagnose.fitting.fit import Fit, fit
+from mpc_sgft.diagnose.fitting.flexible import Flexible
+from mpc_sgft.diagnose.fitting.hypothesis import Entry, entry
+from mpc_sgft.diagnose.fitting.prepare import NOISE, Setup
+from mpc_sgft.diagnose.fitting.screen import Effort
+from mpc_sgft.diagnose.fitting.search import no_worse, search, swaps
+from mpc_sgft.diagnose.simulation.plant import Change, Plant
+from mpc_sgft.diagnose.verdict.naming import caution, gains, holds, judge_entries
 
 Points = Sequence[Sequence[np.ndarray]]
 PENDULUM = """<mujoco><worldbody><body><joint name="hinge" axis="0 1 0"/><geom size="0.05" pos="0 0 -0.4" mass="1"/>

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from mpc_sgft.command.errors import UserError
-from mpc_sgft.diagnose.plant import Axis
-from mpc_sgft.diagnose.record import Table
+from mpc_sgft.diagnose.data.measured import Table
+from mpc_sgft.diagnose.simulation.plant import Axis
 from mpc_sgft.diagnose.units import check_order, check_speeds, check_units
 
 T = np.arange(1000) * 0.004

@@ -11,7 +11,7 @@ import yaml
 
 from envs.effects import load
 from mpc_sgft.diagnose import diagnose
-from mpc_sgft.diagnose.record import write_csv
+from mpc_sgft.diagnose.data.measured import write_csv
 
 SANDER = """<mujoco><option timestep="0.002"/><worldbody><geom name="table" type="plane" size="2 2 0.1" friction="0.6"/>
 <body name="block" pos="0 0 0.05"><joint name="x" type="slide" axis="1 0 0"/><joint name="z" type="slide" axis="0 0 1"/>

@@ -18,7 +18,7 @@ from mpc_sgft import deploy
 from mpc_sgft.command.errors import UserError
 from mpc_sgft.storage import checkpoint
 from mpc_sgft.storage.episode_file import read_episode
-from tools import relearn
+from tools.studies import relearn
 
 TINY = ["+experiment=debug", "task=pendulum", "log.tensorboard=false", "log.rerun=false"]
 NEEDED = "task gap method seed real_rollouts aborted_rollouts zero_shot_success final_success rollouts_to_90".split()

@@ -1,0 +1,1 @@
+"""Measured episodes, and what can be said of them without a model of the world."""

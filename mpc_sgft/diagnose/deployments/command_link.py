@@ -1,0 +1,114 @@
+"""First link of the chain: from what was commanded to what the servos were driven to.
+
+A servo's force is linear in its control, its position and its velocity. So the measured force tells which control the
+servo really acted on, whatever happened to the command on its way. It is compared with what the interface makes of the
+recorded actions if some effects are there; no simulation is needed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+from scipy.signal import lfilter
+
+from envs.effects.actuator_delay import ActuatorDelay
+from envs.effects.actuator_lag import ActuatorLag
+from envs.effects.base import Effect
+from envs.task import AbstractTask, whole_steps
+from mpc_sgft.command.errors import UserError
+from mpc_sgft.diagnose.data.held_commands import MIN_LAG
+from mpc_sgft.diagnose.data.measured import Array
+from mpc_sgft.diagnose.deployments.recordings import Rollout
+
+
+def measured_drive(model: mujoco.MjModel, episode: Rollout) -> Array:
+    """Control that each servo acted on at the joint samples, [S, nu], in units of the control.
+
+        force = gain u + b0 + b1 q + b2 v   at the beginning of the physics step that ends at the sample
+
+    Raises:
+        UserError: If an actuator's force is not of this form.
+    """
+    before = episode.time - model.opt.timestep
+    out = np.empty_like(episode.force)
+    for i in range(episode.force.shape[1]):
+        joint, gear = model.actuator_trnid[i, 0], model.actuator_gear[i, 0]
+        linear = model.actuator_gaintype[i] == int(mujoco.mjtGain.mjGAIN_FIXED)
+        if model.actuator_trntype[i] != int(mujoco.mjtTrn.mjTRN_JOINT) or not linear or joint >= episode.q.shape[1]:
+            name = model.actuator(i).name
+            raise UserError(f"actuator {name!r}: diagnose --run needs motors or servos with a fixed gain at a joint.")
+        q, v = (gear * np.interp(before, episode.time, x[:, joint]) for x in (episode.q, episode.v))
+        b = model.actuator_biasprm[i]
+        out[:, i] = (episode.force[:, i] - b[0] - b[1] * q - b[2] * v) / model.actuator_gainprm[i, 0]
+    return out
+
+
+class Commands:
+    """What the interface sends to the servos for the actions of all episodes.
+
+    Args:
+        task: The nominal task.
+        episodes: With E episodes of at most T steps.
+    """
+
+    def __init__(self, task: AbstractTask, episodes: Sequence[Rollout]):
+        self.task = task
+        self.substeps = whole_steps(task.control_dt, task.sim_dt)
+        longest = max(len(e.action) for e in episodes)
+        self.action = np.stack([_padded(e.action, longest) for e in episodes], 1)  # [T, E, A]
+        self.first = np.stack([e.q[0] for e in episodes])  # [E, nj]
+
+    @property
+    def times(self) -> Array:
+        """Ends of all physics steps since the start [s], [T N]."""
+        return self.task.sim_dt * np.arange(1, len(self.action) * self.substeps + 1, dtype=float)
+
+    def drive(self, changes: Sequence[Sequence[Effect]]) -> Array:
+        """Control at the servos in every physics step if some effects are there, [K, E, T N, nu] of K sets."""
+        corners = self._corners(changes)
+        ramp = np.arange(1, self.substeps + 1)[:, None] / self.substeps
+        steps = corners[:, :, :-1, None] + ramp * (corners[:, :, 1:] - corners[:, :, :-1])[:, :, :, None]
+        out = steps.reshape(*corners.shape[:2], -1, corners.shape[3])
+        for k, effects in enumerate(changes):
+            first = corners[k, :, :1]
+            for effect in effects:
+                if isinstance(effect, ActuatorDelay):
+                    out[k] = _delayed(out[k], first, effect.delay / self.task.sim_dt)
+                elif isinstance(effect, ActuatorLag) and effect.time_constant > MIN_LAG:
+                    out[k] = _lagged(out[k], first, np.exp(-self.task.sim_dt / effect.time_constant))
+        return out
+
+    def _corners(self, changes: Sequence[Sequence[Effect]]) -> Array:
+        """Control at the beginning and after each control step, before delay and lag, [K, E, T + 1, nu]."""
+        count, size = len(changes), len(self.first)
+        first = np.tile(self.first, (count, 1))
+        target = self.task.hold(first)
+        told = [self.task.ctrl(target, first)]
+        for sent in self.action:
+            realised = np.tile(sent, (count, 1))
+            for k, effects in enumerate(changes):
+                mine = slice(k * size, (k + 1) * size)
+                for effect in effects:
+                    realised[mine] = effect.command(realised[mine], self.task)
+            target = self.task.move(target, realised)
+            told.append(self.task.ctrl(target, told[-1]))
+        return np.stack(told, 1).reshape(count, size, len(told), -1)
+
+
+def _padded(action: Array, length: int) -> Array:
+    return np.concatenate([action, np.zeros((length - len(action), action.shape[1]))])
+
+
+def _delayed(u: Array, first: Array, steps: float) -> Array:
+    """Controls [E, T, nu] late by a number of steps, between whole steps interpolated; `first` [E, 1, nu] before."""
+    whole = int(steps)
+    part = steps - whole
+    long = np.concatenate([np.repeat(first, whole + 1, 1), u], 1)
+    return (1 - part) * long[:, 1 : 1 + u.shape[1]] + part * long[:, : u.shape[1]]
+
+
+def _lagged(u: Array, first: Array, keep: float) -> Array:
+    """First-order low pass of held controls [E, T, nu] that stood at `first` [E, 1, nu]; as MuJoCo's filterexact."""
+    return np.asarray(lfilter([1 - keep], [1.0, -keep], u - first, axis=1)) + first

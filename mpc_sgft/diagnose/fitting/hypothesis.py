@@ -1,0 +1,82 @@
+"""A set of effects, fitted and judged."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from mpc_sgft.diagnose.candidates.effect_table import INCLUDES
+from mpc_sgft.diagnose.candidates.library import Term
+from mpc_sgft.diagnose.data.measured import Array
+from mpc_sgft.diagnose.fitting.fit import Fit, by_parts, left_out_errors, window_errors
+from mpc_sgft.diagnose.fitting.prepare import Setup
+
+SEEN = 1e-3  # a parameter whose derivative is smaller than this share of its effect's largest changes nothing
+
+
+class Entry(NamedTuple):
+    """A set of effects, fitted and judged.
+
+    Attributes:
+        fit: Nominal terms and effects.
+        effects: Number of effects; they are the last terms.
+        errors: Error of every part of every window when that is not fitted, [(W fitted + W held) parts].
+        fitted: The same with the fitted windows as they were fitted.
+        complexity: Parameters of the effects that change anything.
+    """
+
+    fit: Fit
+    effects: int
+    errors: Array
+    fitted: Array
+    complexity: int
+
+    @property
+    def terms(self) -> tuple[Term, ...]:
+        return self.fit.terms[len(self.fit.terms) - self.effects :]
+
+    @property
+    def values(self) -> tuple[Array, ...]:
+        return self.fit.values[len(self.fit.terms) - self.effects :]
+
+    @property
+    def names(self) -> list[str]:
+        return [t.label for t in self.terms]
+
+    @property
+    def key(self) -> frozenset[str]:
+        return frozenset(t.label + str(t.fixed) for t in self.terms)
+
+    @property
+    def idle(self) -> int:
+        """Parameters that change nothing here, of effects that are there to do more than simpler ones."""
+        rich = any(t.effect in INCLUDES for t in self.terms)
+        return sum(len(t.size) for t in self.terms) - self.complexity if rich else 0
+
+    @property
+    def error(self) -> float:
+        return float(self.errors.mean())
+
+
+def entry(setup: Setup[Any], f: Fit) -> Entry:
+    """Judge a fit on all windows: fitted ones by leaving out their block, the others as they are.
+
+    Leaving out is to first order. Where that foretells more than the fit and no effect do, the rest of the data do not
+    determine the effect, and none is foretold. One of a few windows may hold all that shows an effect. Then its parts
+    are left out one by one, if the rest of it foretells them but for noise.
+    """
+    nominal = len(setup.baseline.terms)
+    held = window_errors(setup.problem, f, setup.held, setup.parts)
+    blocks = np.repeat(setup.blocks[:, None], setup.parts, axis=1)
+    each = np.arange(blocks.size).reshape(blocks.shape)
+    left_in = by_parts(f.r**2, setup.parts)
+    most = np.maximum(left_in, by_parts(setup.baseline.r**2, setup.parts)) if len(f.terms) > nominal else np.inf
+    left_out = (np.minimum(left_out_errors(f, b), most) for b in (each, blocks))
+    by_part, errors, fitted = (setup.judged(np.concatenate([x, held])) for x in (*left_out, left_in))
+    if setup.one_window(by_part):
+        errors = by_part
+    ends = np.cumsum([len(t.size) for t in f.terms])
+    norms = np.split(np.sqrt((f.J**2).sum((0, 1))), ends[:-1])[nominal:]  # of each effect's parameters
+    seen = sum(int((own > SEEN * max(float(own.max()), 1e-12)).sum()) for own in norms if len(own))
+    return Entry(f, len(f.terms) - nominal, errors, fitted, seen)

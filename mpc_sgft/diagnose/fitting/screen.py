@@ -1,0 +1,270 @@
+"""Which sets of effects deserve a full fit: one step from where their subset ended, then a few on some windows."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from mpc_sgft.diagnose.candidates.library import HIDDEN, Term, enrich, includes
+from mpc_sgft.diagnose.data.measured import Array, Index
+from mpc_sgft.diagnose.fitting.fit import fit, robust, typical, weights
+from mpc_sgft.diagnose.fitting.hypothesis import Entry
+from mpc_sgft.diagnose.fitting.prepare import ABOVE_NOISE, NOISE, Setup
+
+INVISIBLE = 1e-4  # times the noise: an effect of typical size that changes less is no candidate
+SHRINKS, TOO_MUCH = 3, 1.0  # a start that adds this much to log(1 + e) is tried at a tenth, so many times
+
+
+class Effort(NamedTuple):
+    """How widely to search.
+
+    Attributes:
+        beam: Sets that are extended, to two effects, to three.
+        full: Candidates that get a full fit: alone, as a second effect, as a third; twice as many get a quick one.
+        screen, sharpen: Windows for one step of each, and for quick fits.
+        quick, last: Iterations of a quick fit, and of the full one that goes on from it.
+        enough: Pairs are tried although no effect alone gains, if the error is above this.
+        pairs: Of those that the screened effects make, how many get a quick fit.
+        exchange: Full fits with one effect of a set that leaves much replaced by another; 0 for no such exchange.
+    """
+
+    beam: tuple[int, ...] = (2, 1)
+    full: tuple[int, ...] = (5, 2, 2)
+    screen: int = 6
+    sharpen: int = 10
+    quick: int = 3
+    last: int = 8
+    enough: float = NOISE + ABOVE_NOISE
+    pairs: int = 6
+    exchange: int = 4
+
+
+class Proposal(NamedTuple):
+    """A set to be fitted.
+
+    Attributes:
+        terms, start: The set, and where its fit starts.
+        cost: Its error there on some windows, as a fit measures it.
+        gain: By how much less its squared residuals sum up to than the best set's, both after a quick fit.
+    """
+
+    terms: tuple[Term, ...]
+    start: tuple[Array, ...]
+    cost: float
+    gain: float = 0.0
+
+
+class Sample(NamedTuple):
+    """What one effect at one start does to the residuals of the nominal model: by how much it moves them [W, m], and
+    their derivatives by its parameters in typical sizes [W, m, p]."""
+
+    term: Term
+    start: Array
+    moved: Array
+    J: Array
+
+
+def proposals(parent: Entry, terms: Sequence[Term], max_effects: int, shares: tuple[float, ...]) -> list[Option]:
+    """Sets one step larger, one for each start of the new term."""
+    out = []
+    base, values = parent.fit.terms, parent.fit.values
+    mine = {t.label for t in parent.terms}
+    for term in terms:
+        simpler = [i for i, old in enumerate(base) if includes(term, old)]
+        if any(includes(old, term) for old in parent.terms) or (term.label in mine and not simpler):
+            continue
+        if simpler:
+            i = simpler[0]
+            for start in enrich(term, base[i], values[i]):
+                out.append(Option((*base[:i], term, *base[i + 1 :]), [*values[:i], start, *values[i + 1 :]], i))
+        elif parent.effects < max_effects:
+            out += [Option((*base, term), [*values, start], len(base)) for start in spread_starts(term, shares)]
+    return out
+
+
+def spread_starts(term: Term, shares: tuple[float, ...]) -> list[Array]:
+    """The starts of a term, at these shares of their distance from no effect."""
+    return [smaller(term, s, share) for share in shares for s in term.starts]
+
+
+def smaller(term: Term, start: Array, share: float) -> Array:
+    """A start at a share of its distance from no effect."""
+    some = [n not in HIDDEN for n in term.names]
+    return np.where(some, term.neutral + share * (start - term.neutral), start)
+
+
+def key_of(setup: Setup[Any], terms: Sequence[Term]) -> frozenset[str]:
+    """Of a set of effects, whatever their order."""
+    return frozenset(t.label + str(t.fixed) for t in terms[len(setup.baseline.terms) :])
+
+
+class Option(NamedTuple):
+    """A set to try: its terms, where they start, and which of them is new."""
+
+    terms: tuple[Term, ...]
+    start: list[Array]
+    new: int
+
+
+class Look(NamedTuple):
+    """An option seen from one Gauss-Newton step.
+
+    Attributes:
+        option: The option.
+        here, there: Error at its start, and where the step leads, by derivatives.
+        tries: Points on the way, to be simulated.
+        sample: What the new effect does; None if that is nothing.
+    """
+
+    option: Option
+    here: float
+    there: float = np.inf
+    tries: Sequence[Sequence[Array]] = ()
+    sample: Sample | None = None
+
+
+def screen(
+    setup: Setup[Any], parent: Entry, options: list[Option], windows: int
+) -> tuple[list[Proposal], list[Sample]]:
+    """Order options by their error after one Gauss-Newton step: of each set the most promising start, of one in which
+    an effect becomes a richer one every start, as it is."""
+    problem, pick, scale = setup.problem, spread(setup.fitted, windows), typical(parent.fit.r)
+    looks = [look(setup, parent, option, pick) for option in options]
+    before = float(robust(parent.fit.r[np.searchsorted(setup.fitted, pick)], scale))
+    for last in {_aside(x.option): x for x in looks}.values():  # the smallest start
+        for _ in range(SHRINKS):
+            if last.here < before + TOO_MUCH:
+                break
+            terms, start, new = last.option
+            less = [*start[:new], smaller(terms[new], start[new], 0.1), *start[new + 1 :]]
+            looks.append(last := look(setup, parent, Option(terms, less, new), pick))
+    by_set: dict[Any, list[Look]] = {}
+    for x in looks:
+        richer = x.option.new < len(parent.fit.terms)
+        key = key_of(setup, x.option.terms), tuple(x.option.start[x.option.new]) if richer else ()
+        if x.sample is not None:
+            by_set.setdefault(key, []).append(x)
+    out = []
+    for (_, richer), mine in by_set.items():
+        x, y = min(mine, key=lambda x: x.there), min(mine, key=lambda x: x.here)  # derivatives may promise too much
+        own = Proposal(x.option.terms, tuple(x.option.start), x.here)
+        costs = robust(problem.residuals(own.terms, x.tries, pick), scale)
+        reached = [Proposal(own.terms, tuple(t), float(c)) for t, c in zip(x.tries, costs, strict=True)]
+        stay = Proposal(y.option.terms, tuple(y.option.start), y.here)
+        first = min([own, *reached, stay], key=lambda p: p.cost)
+        out.append(own._replace(cost=first.cost) if richer else first)
+    return sorted(out, key=lambda p: p.cost), [x.sample for x in looks if x.sample is not None]
+
+
+def _aside(option: Option) -> tuple[str, ...]:
+    """An effect, and what its start says of parameters that mean nothing while it is neutral."""
+    term, start = option.terms[option.new], option.start[option.new]
+    return term.label, *(f"{n}={x:g}" for n, x in zip(term.names, start, strict=True) if n in HIDDEN)
+
+
+def look(setup: Setup[Any], parent: Entry, option: Option, pick: Index) -> Look:
+    """Simulate an option at its start and around it, on the picked windows."""
+    problem, scale = setup.problem, typical(parent.fit.r)
+    rows = np.searchsorted(setup.fitted, pick)
+    terms, start, new = option
+    term = terms[new]
+    d = problem.step
+    steps = [(-d if start[new][i] + d * s > term.high[i] else d) * s for i, s in enumerate(term.size)]
+    points = [start]
+    for i, step in enumerate(steps):
+        moved = list(start)
+        moved[new] = start[new] + step * np.eye(len(steps))[i]
+        points.append(moved)
+    r = problem.residuals(terms, points, pick)
+    J_new = np.moveaxis((r[1:] - r[0]) * (term.size / np.array(steps))[:, None, None], 0, -1)
+    here = float(robust(r[0], scale))
+    if np.sqrt(np.mean(J_new**2)) < INVISIBLE:
+        return Look(option, here)
+    J_old = parent.fit.J[rows] if new == len(parent.fit.terms) else np.zeros((*r.shape[1:], 0))
+    J = np.concatenate([J_old, J_new], -1)
+    w = weights(r[0])
+    A, g = np.einsum("w,wmp,wmq->pq", w, J, J, optimize=True), np.einsum("w,wmp,wm->p", w, J, r[0], optimize=True)
+    A = A + np.diag(1e-3 * np.diag(A) + 1e-9 * max(float(np.diag(A).max()), 1e-30))
+    step = -np.linalg.solve(A, g)
+    tries = [_moved(terms, start, new, step * share, J_old.shape[-1]) for share in (1.0, 0.3)]
+    reach = [(b - a) / t.size for t, a, b in zip(terms, start, tries[0], strict=True)]  # as far as bounds allow
+    there = float(robust(r[0] + J @ np.concatenate(reach if J_old.shape[-1] else [reach[new]]), scale))
+    return Look(option, here, there, tries, Sample(term, start[new], r[0] - parent.fit.r[rows], J_new))
+
+
+def couple(parent: Entry, samples: list[Sample], setup: Setup[Any], effort: Effort) -> list[Proposal]:
+    """Pairs of effects that together may do what neither does alone, judged by what each does to the residuals.
+
+    The residuals of two effects are taken for the nominal model's, moved by the one and by the other: no simulation.
+    """
+    rows = np.searchsorted(setup.fitted, spread(setup.fitted, effort.screen))
+    r0, J0 = parent.fit.r[rows], parent.fit.J[rows]
+    root = np.sqrt(weights(r0))[:, None, None]
+    parts = [r0[..., None], J0, *(x for s in samples for x in (s.moved[..., None], s.J))]
+    columns = (np.concatenate(parts, -1) * root).reshape(r0.size, -1)
+    gram = columns.T @ columns
+    ends = np.cumsum([p.shape[-1] for p in parts])
+    nominal = np.arange(1, ends[1])
+    best: dict[frozenset[str], Proposal] = {}
+    for j, second in enumerate(samples):
+        for i, first in enumerate(samples[:j]):
+            if first.term.label == second.term.label or _overlap(first.term, second.term):
+                continue
+            own = [np.arange(ends[2 * k + 2], ends[2 * k + 3]) for k in (i, j)]
+            free = np.concatenate([nominal, *own])
+            fixed = [0, ends[2 * i + 1], ends[2 * j + 1]]  # the nominal residuals, and how either effect moves them
+            A, g = gram[np.ix_(free, free)], gram[np.ix_(free, fixed)].sum(1)
+            step = -np.linalg.solve(A + np.diag(1e-3 * np.diag(A) + 1e-12), g)
+            start, done = list(parent.fit.values), 0
+            for term, value in zip(
+                [*parent.fit.terms, first.term, second.term], [*start, first.start, second.start], strict=True
+            ):
+                size = slice(done, done + len(value))
+                step[size] = (np.clip(value + step[size] * term.size, term.low, term.high) - value) / term.size
+                done += len(value)
+            cost = float(gram[np.ix_(fixed, fixed)].sum() + 2 * g @ step + step @ A @ step)
+            terms = (*parent.fit.terms, first.term, second.term)
+            key = key_of(setup, terms)
+            if key not in best or cost < best[key].cost:
+                values = [*parent.fit.values, first.start, second.start]
+                cuts = np.split(step, np.cumsum([len(v) for v in values])[:-1])
+                moved = [v + s * t.size for v, s, t in zip(values, cuts, terms, strict=True)]
+                best[key] = Proposal(terms, tuple(moved), cost)
+    return sorted(best.values(), key=lambda p: p.cost)[: effort.pairs]
+
+
+def _overlap(a: Term, b: Term) -> bool:
+    return includes(a, b) or includes(b, a)
+
+
+def sharpen(setup: Setup[Any], best: Entry, ranked: list[Proposal], effort: Effort) -> list[Proposal]:
+    """Order proposals anew after a few iterations on some windows: one step says little of some effects."""
+    if not ranked:
+        return []
+    pick, out = spread(setup.fitted, effort.sharpen), []
+    scale = typical(best.fit.r)
+    before = float(np.sum(fit(setup.problem, best.fit.terms, best.fit.values, pick, effort.quick).r ** 2))
+    for p in ranked:
+        f = fit(setup.problem, p.terms, p.start, pick, effort.quick)
+        out.append(Proposal(f.terms, f.values, float(robust(f.r, scale)), before - float(np.sum(f.r**2))))
+    return sorted(out, key=lambda p: p.cost)
+
+
+def _moved(terms: Sequence[Term], start: Sequence[Array], new: int, step: Array, old: int) -> list[Array]:
+    """A point after a step in typical sizes: over all old terms and the new one, or over the new one alone."""
+    out, at = list(start), 0
+    for i in range(len(terms)) if old else [new]:
+        if i == new and old:
+            delta = step[old:]
+        else:
+            delta = step[at : at + len(terms[i].size)]
+            at += len(terms[i].size)
+        out[i] = np.clip(start[i] + delta * terms[i].size, terms[i].low, terms[i].high)
+    return out
+
+
+def spread(windows: Index, count: int) -> Index:
+    """So many of the windows, from first to last."""
+    return windows[np.unique(np.linspace(0, len(windows) - 1, min(count, len(windows))).astype(int))]

@@ -1,0 +1,1 @@
+"""The nominal model, and measured windows simulated with it."""

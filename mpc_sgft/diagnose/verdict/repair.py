@@ -1,0 +1,57 @@
+"""The repaired model as plain MJCF, and the effects as yaml for `pretrain` and `deploy`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import mujoco
+
+from envs.effects.base import Effect, load
+from mpc_sgft.diagnose.candidates.library import as_gap, settings
+from mpc_sgft.diagnose.candidates.nominal import scale
+from mpc_sgft.diagnose.fitting.hypothesis import Entry
+from mpc_sgft.diagnose.simulation.plant import FORCE, Plant
+
+
+def repaired_spec(plant: Plant, best: Entry) -> tuple[mujoco.MjSpec, list[str]]:
+    """The scene with refitted quantities and effects in it, and what MJCF cannot carry, in words."""
+    spec, notes = plant.spec.copy(), []
+    for term, value in zip(best.fit.terms, best.fit.values, strict=True):
+        if term.effect == "nominal":
+            scale(spec, plant, term.names[0], term.at[0], float(value[0]))
+            continue
+        effect = load({term.effect: settings(term, value)})[0]
+        if type(effect).edit_spec is not Effect.edit_spec:
+            effect.edit_spec(spec)
+        if not type(effect).native:
+            notes.append(f"{term.label}: MJCF has no field for it; use effects.yaml")
+    for sensor in list(spec.sensors):
+        if sensor.name.startswith(FORCE):
+            spec.delete(sensor)
+    return spec, notes
+
+
+def write(plant: Plant, best: Entry, out: Path) -> list[str]:
+    """Write repaired.xml and effects.yaml; returns notes.
+
+    Raises:
+        ValueError: If the written scene does not load.
+    """
+    import yaml
+
+    spec, notes = repaired_spec(plant, best)
+    spec.compile()
+    path = out / "repaired.xml"
+    path.write_text(spec.to_xml())
+    mujoco.MjModel.from_xml_path(str(path))
+    mapping = as_gap((t.effect, settings(t, v)) for t, v in zip(best.terms, best.values, strict=True))
+    refit = {
+        f"{t.names[0]} {t.at[0]}": round(float(v[0]), 6)
+        for t, v in zip(best.fit.terms, best.fit.values, strict=True)
+        if t.effect == "nominal"
+    }
+    head = "# Written by mpc_sgft.diagnose.\n"
+    if refit:
+        head += f"# Refitted nominal quantities (factors, in repaired.xml only): {refit}\n"
+    (out / "effects.yaml").write_text(head + yaml.safe_dump({"effects": mapping}, sort_keys=False))
+    return notes

@@ -1,0 +1,1 @@
+"""Scripts that time: side by side in one run, as ratios."""

@@ -1,0 +1,96 @@
+"""Deploy into a gap, name it, repair the simulator, pretrain on in it and deploy again; one CSV row each gap and seed.
+
+    python -m tools.studies.close_the_loop results/close_the_loop/close_the_loop.csv --gaps turned --seeds 0 1 2
+    python -m tools.studies.close_the_loop small.csv --gaps dev_turned --seeds 0 --transitions 5000 --set rollouts=4
+
+Each gap and seed has a folder under --runs; a first deployment or a comparison that is there is not made again. The gap
+is known to the two deployments alone.
+"""
+
+import argparse
+import csv
+import json
+from pathlib import Path
+
+from mpc_sgft import deploy
+from mpc_sgft.diagnose.__main__ import main as diagnose
+
+COLUMNS = [
+    "gap",
+    "seed",
+    "verdict",
+    "found",
+    "diagnose_seconds",
+    "transitions",
+    "zero_shot_before",
+    "zero_shot_after",
+    "final_before",
+    "final_after",
+    "rollouts_to_95_before",
+    "rollouts_to_95_after",
+]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("csv", type=Path)
+    parser.add_argument("--gaps", nargs="+", default=["turned", "sluggish", "skate"])
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
+    parser.add_argument("--transitions", type=int, default=60_000)
+    parser.add_argument("--set", nargs="*", default=[], metavar="name=value", help="overrides of the deployments")
+    parser.add_argument("--runs", type=Path, default=Path("runs/close_the_loop"))
+    args = parser.parse_args()
+    rows = []
+    for gap in args.gaps:
+        for seed in args.seeds:
+            rows.append(one(gap, seed, args.runs / f"{gap}-{seed}", args.transitions, args.set))
+            write(args.csv, rows)
+
+
+def one(gap: str, seed: int, run: Path, transitions: int, overrides: list[str]) -> dict[str, object]:
+    """One row; raises SystemExit with the command's exit code if one fails."""
+    if not (run / "summary.json").exists():
+        start = ["--resume", str(run)] if run.exists() else [f"gap={gap}", f"seed={seed}", f"run_dir={run}"]
+        check(deploy.main([*start, *([] if run.exists() else ["log.rerun=false", *overrides])]))
+    found = run / "diagnosis"
+    if not (found / "retrain.json").exists():
+        check(diagnose(["--run", str(run), "--retrain", "--retrain-transitions", str(transitions)]))
+    report = json.loads((found / "report.json").read_text())
+    row: dict[str, object] = {
+        "gap": gap,
+        "seed": seed,
+        "verdict": report["verdict"],
+        "found": " + ".join(words(e) for e in report["effects"]),
+        "diagnose_seconds": report["seconds"],
+    }
+    if (found / "retrain.json").exists():  # a verdict without an effect leaves nothing to retrain on
+        result = json.loads((found / "retrain.json").read_text())
+        row["transitions"] = result["transitions"]
+        for when in ("before", "after"):
+            row[f"zero_shot_{when}"] = result[when]["zero_shot_success"]
+            row[f"final_{when}"] = result[when]["final_success"]
+            row[f"rollouts_to_95_{when}"] = result[when]["rollouts_to_95"]
+    return row
+
+
+def words(effect: dict) -> str:
+    """`actuator_gain gain=0.6`"""
+    numbers = " ".join(f"{k}={v['value']:.3g}" for k, v in effect["parameters"].items())
+    return f"{'@'.join([effect['name'], *effect['at'][:1]])} {numbers}"
+
+
+def check(code: int) -> None:
+    if code:
+        raise SystemExit(code)
+
+
+def write(path: Path, rows: list[dict[str, object]]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,78 @@
+"""Run many deployments, side by side and resumable, and collect their learning curves into one CSV.
+
+    python -m tools.studies.study results/transfer/sgft.csv --gaps turned sluggish skate --seeds 0 1 2 3 4
+    python -m tools.studies.study results/horizon/horizon.csv --gaps sluggish --variants horizon=1 horizon=2
+
+Each run is `python -m mpc_sgft.deploy` in a process of its own with one thread; its folder is kept under --runs, and a
+run whose summary is there is not repeated. With several --checkpoints, seed s uses number s modulo their count.
+"""
+
+import argparse
+import csv
+import itertools
+import json
+import os
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+COLUMNS = ["gap", "method", "variant", "seed", "rollouts", "success", "episodes", "frozen_sha256"]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("csv", type=Path)
+    parser.add_argument("--gaps", nargs="+", required=True)
+    parser.add_argument("--methods", nargs="+", default=["sgft"])
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0])
+    parser.add_argument(
+        "--checkpoints", nargs="+", default=[None], help="run folders or files; default: the shipped one"
+    )
+    parser.add_argument("--variants", nargs="+", default=[""], metavar="name=value", help="a run for each; '' as it is")
+    parser.add_argument("--set", nargs="*", default=[], metavar="name=value", help="overrides of every run")
+    parser.add_argument("--runs", type=Path, default=Path("runs/study"))
+    parser.add_argument("--jobs", type=int, default=2)
+    args = parser.parse_args()
+    jobs = list(itertools.product(args.seeds, args.gaps, args.methods, args.variants))
+
+    def work(job: tuple[int, str, str, str]) -> dict | None:
+        seed, gap, method, variant = job
+        checkpoint = args.checkpoints[seed % len(args.checkpoints)]
+        label = "-".join(
+            str(x).translate(str.maketrans("/=", "__")) for x in (args.csv.stem, gap, method, variant, seed) if x != ""
+        )
+        folder = args.runs / label
+        words = [f"gap={gap}", f"method={method}", f"seed={seed}", f"run_dir={folder}", "log.rerun=false", "quiet=true"]
+        words += [variant] if variant else []
+        words += [f"checkpoint={checkpoint}"] if checkpoint else []
+        summary = folder / "summary.json"
+        if not summary.exists():
+            command = [sys.executable, "-m", "mpc_sgft.deploy", *words, *args.set]
+            if folder.exists():
+                command = [sys.executable, "-m", "mpc_sgft.deploy", "--resume", str(folder)]
+            done = subprocess.run(command, capture_output=True, text=True, env=os.environ | {"OMP_NUM_THREADS": "1"})
+            if done.returncode:
+                print(f"{label}: failed ({done.returncode})\n{done.stderr[-2000:]}", flush=True)
+                return None
+        result = json.loads(summary.read_text())
+        curve = ", ".join(f"{k}: {v:.0%}" for k, v in result["curve"].items())
+        print(f"{label}: {curve} ({result['wall_seconds']:.0f} s)", flush=True)
+        return result | {"variant": variant}
+
+    with ThreadPoolExecutor(args.jobs) as pool:
+        results = [r for r in pool.map(work, jobs) if r is not None]
+    rows = [
+        [r["gap"], r["method"], r["variant"], r["seed"], k, s, r["evaluation_episodes"], r["frozen_sha256"][:12]]
+        for r in results
+        for k, s in r["curve"].items()
+    ]
+    args.csv.parent.mkdir(parents=True, exist_ok=True)
+    with args.csv.open("w", newline="") as file:
+        csv.writer(file).writerows([COLUMNS, *rows])
+    if len(results) < len(jobs):
+        sys.exit(f"{len(jobs) - len(results)} of {len(jobs)} runs failed")
+
+
+if __name__ == "__main__":
+    main()
