@@ -8,11 +8,13 @@ BIN := .venv/bin
 STAMP := .venv/.installed
 # Workers of the test run. One thread each: the fast suite is many small tensors.
 WORKERS ?= 2
+# Which of them: make test TESTS="tests/planners -k mppi"
+TESTS ?=
 APT := mesa-vulkan-drivers libegl1 libegl-mesa0 libgl1-mesa-dri libosmesa6 libusb-1.0-0
 
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: help setup system robot demo test test-all check format clean
+.PHONY: help setup system robot demo test-setup test test-all docs check format clean
 
 help: ## List the targets.
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -30,26 +32,40 @@ $(STAMP): requirements.lock pyproject.toml
 	@$(BIN)/python -m pip install -q --no-deps --no-build-isolation -e .
 	@touch $(STAMP)
 
-system: ## Install the apt packages for rendering and pictures without a screen (root only).
+system: ## Install the apt packages for rendering without a screen (root, or sudo that asks nothing).
 	@missing=""; for p in $(APT); do dpkg -s $$p > /dev/null 2>&1 || missing="$$missing $$p"; done; \
+	sudo=""; [ "$$(id -u)" = 0 ] || sudo="sudo -n"; \
 	if [ -z "$$missing" ]; then echo "system packages: all there"; \
-	elif ! command -v apt-get > /dev/null; then echo "no apt-get here: tests that need$$missing will be skipped"; \
-	elif [ "$$(id -u)" != 0 ]; then echo "not root: tests that need a screen-less renderer will be skipped; sudo apt-get install$$missing"; \
-	else apt-get update -qq < /dev/null && DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends $$missing < /dev/null > /dev/null; \
-	  echo "installed:$$missing"; fi
+	elif ! command -v apt-get > /dev/null; then echo "no apt-get here: what draws without a screen is left out; it needs$$missing"; \
+	elif [ -n "$$sudo" ] && ! sudo -n true 2> /dev/null; then \
+	  echo "not root: what draws without a screen is left out; sudo apt-get install$$missing brings it"; \
+	elif { $$sudo apt-get update -qq && $$sudo env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends $$missing; } \
+	  < /dev/null > /dev/null; then echo "installed:$$missing"; \
+	else echo "apt-get could not install$$missing: what draws without a screen is left out"; fi
 
 robot: setup ## Install the robot's client and its stand-in (Linux only).
 	@$(BIN)/python -c 'import franky, franky_sim' 2> /dev/null \
-	  || $(BIN)/python -m pip install -q --no-build-isolation -c requirements.lock -e '.[franka,franka-sim]'
+	  || { echo "installing the robot's client"; $(BIN)/python -m pip install -q --no-build-isolation -c requirements.lock -e '.[franka,franka-sim]'; }
 
 demo: setup ## Deploy the shipped checkpoint into a hidden gap, in simulation (minutes).
 	@$(BIN)/python -m mpc_sgft.deploy --backend sim +experiment=demo
 
-test: setup ## Run the fast tests.
-	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n $(WORKERS) -m "not slow"
+# What the tests need beside setup, where it can be had here; what cannot is left out and named at the end of the run.
+test-setup: setup system
+	@[ "$$(uname -s)" != Linux ] || $(MAKE) --no-print-directory robot \
+	  || echo "the robot's client could not be installed: its tests are left out"
 
-test-all: setup ## Run every test, the slow ones too.
-	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n $(WORKERS)
+test: test-setup ## Set up what the tests need, and run the fast ones.
+	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n $(WORKERS) -m "not slow" $(TESTS)
+
+test-all: test-setup ## Run every test, the slow ones too.
+	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n $(WORKERS) $(TESTS)
+
+docs: setup ## Build the documentation into site/ (strict).
+	@$(BIN)/python -c 'import mkdocs, material, mkdocstrings' 2> /dev/null \
+	  || { echo "installing the generator of the documentation"; $(BIN)/python -m pip install -q --no-build-isolation -c requirements.lock -e '.[docs]'; }
+	@$(BIN)/python -m mkdocs build --strict --quiet
+	@echo "site/index.html is the documentation"
 
 check: setup ## Formatting, linting, types.
 	@$(BIN)/ruff format --check .
@@ -61,5 +77,5 @@ format: setup ## Rewrite the files in the house format.
 	@$(BIN)/ruff check --fix .
 
 clean: ## Remove what builds leave behind; .venv and runs/ stay.
-	@rm -rf build dist *.egg-info .pytest_cache .ruff_cache .hypothesis
+	@rm -rf build dist site *.egg-info .pytest_cache .ruff_cache .hypothesis
 	@find . -name __pycache__ -not -path './.venv/*' -prune -exec rm -rf {} +

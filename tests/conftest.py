@@ -7,7 +7,6 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable
-from ctypes.util import find_library
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +17,8 @@ if TYPE_CHECKING:
     from envs.tasks.push import Push
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch is imported: workers must not fight over the cores
+
+pytest_plugins = ["tests.left_out"]
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -35,7 +36,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         return
     for item in items:
         if "gpu" in item.keywords:
-            item.add_marker(pytest.mark.skip(reason="needs a CUDA device"))
+            item.add_marker(pytest.mark.skip(reason="needs a GPU"))
 
 
 @pytest.fixture
@@ -59,18 +60,68 @@ def data_dir() -> Path:
     for path in candidates:
         if path.is_dir():
             return path
-    pytest.skip(f"no measured data in {candidates[0]}; set MPC_SGFT_DATA to the folder that holds them")
+    pytest.skip(f"needs measured data: none in {candidates[0]}")
+
+
+def _draws(line: list[str], folder: Path, seconds: float, **environment: str) -> str:
+    """Run a command that draws; why it could not, or nothing."""
+    env = {**os.environ, "PYTHONPATH": str(ROOT), **environment}
+    try:
+        done = subprocess.run(line, cwd=folder, env=env, capture_output=True, text=True, timeout=seconds)
+    except subprocess.TimeoutExpired:
+        return f"nothing was drawn in {seconds:.0f} s"
+    return "" if done.returncode == 0 else (done.stderr.strip() or "it failed").splitlines()[-1]
+
+
+DRAW = """
+import mujoco
+model = mujoco.MjModel.from_xml_string(
+    "<mujoco><worldbody><light pos='0 0 3'/><geom size='.3' rgba='1 0 0 1'/></worldbody></mujoco>")
+data, renderer = mujoco.MjData(model), mujoco.Renderer(model, 32, 32)
+mujoco.mj_forward(model, data)
+renderer.update_scene(data)
+assert renderer.render().max() > 50, "the picture is black"
+"""
+
+VIEW = """
+import sys
+from pathlib import Path
+import numpy as np
+import rerun as rr
+from tools.screenshot import screenshot
+recording = rr.RecordingStream("probe")
+recording.save("probe.rrd")
+recording.log("image", rr.Image(np.zeros((8, 8, 3), np.uint8)))
+recording.disconnect()
+screenshot(Path("probe.rrd"), Path("probe.png"), settle=0.0)
+"""
 
 
 @pytest.fixture(scope="session")
-def render(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., tuple[np.ndarray, np.ndarray]]:
+def mujoco_gl(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """A value of MUJOCO_GL with which MuJoCo draws here without a screen: it was tried. Skips where there is none."""
+    folder, why = tmp_path_factory.mktemp("probe"), ""
+    for name in ("egl", "osmesa"):
+        why = _draws([sys.executable, "-c", DRAW], folder, 60, MUJOCO_GL=name)
+        if not why:
+            return name
+    pytest.skip(f"needs a renderer: {why}")
+
+
+@pytest.fixture(scope="session")
+def viewer_draws(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """The rerun viewer draws here without a screen: it was tried. Skips where it cannot."""
+    why = _draws([sys.executable, "-c", VIEW], tmp_path_factory.mktemp("probe"), 180)
+    if why:
+        pytest.skip(f"needs a renderer: {why}")
+
+
+@pytest.fixture(scope="session")
+def render(mujoco_gl: str, tmp_path_factory: pytest.TempPathFactory) -> Callable[..., tuple[np.ndarray, np.ndarray]]:
     """render(shots, ...): what a camera sees of a table with a tag and pucks (tests/render.py); color [n, H, W, 3],
-    depth [n, H, W] m. Skips where nothing can draw without a screen."""
-    pytest.importorskip("cv2", reason="needs the camera extra")
-    found = {"egl": find_library("EGL"), "osmesa": find_library("OSMesa")}
-    name = next((name for name, library in found.items() if library), None)
-    if name is None:
-        pytest.skip("needs libegl1 or libosmesa6 (make system)")
+    depth [n, H, W] m."""
+    pytest.importorskip("cv2", reason="needs the camera's packages")
+    name = mujoco_gl
 
     def draw(shots: list[dict[str, Any]], **settings: Any) -> tuple[np.ndarray, np.ndarray]:
         path = tmp_path_factory.mktemp("render") / "shots.npz"

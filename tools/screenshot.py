@@ -98,9 +98,10 @@ def open_viewer(rrd: Path, *, size: tuple[int, int] = (1600, 900)) -> Iterator[V
         try:
             _wait_for_port(process, port, log)
             client = ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
+            _wait_for_viewer(client, process, log)
             _load(client, rrd)
             yield client
-        except ConnectionError as error:  # the port opens before the viewer finds out that it cannot draw
+        except (ConnectionError, RuntimeError, TimeoutError) as error:
             raise ScreenshotError(_last_words(log)) from error
         finally:
             _stop(process)
@@ -131,11 +132,21 @@ def reports(client: ViewerClient) -> list[str]:
     return found + [f"{entry.level} {entry.target}: {entry.message}" for entry in logs]
 
 
+def _wait_for_viewer(client: ViewerClient, process: subprocess.Popen[bytes], log: Path) -> None:
+    """Until it draws: its port opens before it finds out whether it can."""
+    deadline = time.monotonic() + LOAD_SECONDS
+    while process.poll() is None and time.monotonic() < deadline:
+        try:
+            client.get_state()
+            return
+        except TimeoutError:  # on a busy machine it takes a while
+            time.sleep(0.1)
+    raise ScreenshotError(_last_words(log))
+
+
 def _load(client: ViewerClient, rrd: Path) -> None:
     deadline = time.monotonic() + LOAD_SECONDS
     try:
-        while not _answers(client) and time.monotonic() < deadline:
-            time.sleep(0.1)
         client.open(str(rrd.resolve()))
     except (RuntimeError, TimeoutError) as error:
         raise ScreenshotError(f"The viewer cannot open {rrd}: {error}") from error
@@ -144,15 +155,6 @@ def _load(client: ViewerClient, rrd: Path) -> None:
             raise ScreenshotError(f"{rrd} was still loading after {LOAD_SECONDS:.0f} s.")
         time.sleep(0.1)
     _recording(client)
-
-
-def _answers(client: ViewerClient) -> bool:
-    """Whether the viewer has come up; on a busy machine it takes a while after its port is open."""
-    try:
-        client.get_state()
-    except TimeoutError:
-        return False
-    return True
 
 
 def _recording(client: ViewerClient) -> Recording:

@@ -11,11 +11,11 @@ motion. An effect never does the same thing in two of these places.
 
 import importlib
 import pkgutil
+import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from difflib import get_close_matches
 from functools import cache
-from pathlib import Path
 from typing import Any, ClassVar
 
 import mujoco
@@ -110,8 +110,8 @@ class Effect:
 @cache
 def available() -> tuple[str, ...]:
     """Names of the effects, which are the names of the files in this folder."""
-    folder = str(Path(__file__).parent)
-    return tuple(sorted(m.name for m in pkgutil.iter_modules([folder]) if m.name not in ("base", "passive")))
+    here = sys.modules[__package__].__path__
+    return tuple(sorted(m.name for m in pkgutil.iter_modules(here) if m.name not in ("base", "passive")))
 
 
 Parameters = Mapping[str, Any] | None

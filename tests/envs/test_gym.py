@@ -4,7 +4,6 @@ import os
 import subprocess
 import sys
 import warnings
-from ctypes.util import find_library
 from pathlib import Path
 
 import numpy as np
@@ -165,15 +164,8 @@ many.close()
 """
 
 
-def _renderer() -> str | None:
-    """A way to draw without a screen, by the library that it needs."""
-    found = {"egl": find_library("EGL"), "osmesa": find_library("OSMesa")}
-    return next((name for name, library in found.items() if library), None)
-
-
-@pytest.mark.skipif(_renderer() is None, reason="needs libegl1 or libosmesa6 (make system)")
-def test_pictures_move_with_the_simulation(tmp_path) -> None:
-    env = {**os.environ, "MUJOCO_GL": str(_renderer()), "PYTHONPATH": str(ROOT)}
+def test_pictures_move_with_the_simulation(mujoco_gl, tmp_path) -> None:
+    env = {**os.environ, "MUJOCO_GL": mujoco_gl, "PYTHONPATH": str(ROOT)}
     line = [sys.executable, "-W", "ignore", "-c", PICTURE]
     done = subprocess.run(line, cwd=tmp_path, env=env, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr

@@ -26,13 +26,11 @@ print(default, faults())
 """
 
 
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="glibc only")
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="needs Linux")
 def test_memory_is_not_fetched_again() -> None:
     root = Path(__file__).resolve().parents[2]
     run = subprocess.run(
         [sys.executable, "-c", FAULTS], cwd=root, capture_output=True, text=True, timeout=120, check=True
     )
     default, kept = map(int, run.stdout.split())
-    if default == 0:
-        pytest.skip("this C library keeps freed memory by itself here: nothing to compare with")
-    assert kept < 0.1 * default
+    assert kept < 0.1 * default or default == kept == 0  # some C libraries keep freed memory by themselves

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-cv2 = pytest.importorskip("cv2", reason="needs the camera extra")
+cv2 = pytest.importorskip("cv2", reason="needs the camera's packages")
 
 from envs.perception.calibration import load_calibration  # noqa: E402
 from tools.calibrate_camera import main  # noqa: E402

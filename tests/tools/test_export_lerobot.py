@@ -138,7 +138,7 @@ def lerobot_python() -> str:
     uv = uv_run()[0]
     made = subprocess.run([uv, "sync", "--offline", "--script", str(WRITER)], capture_output=True, text=True)
     if made.returncode:
-        pytest.skip("lerobot's environment is not there; `python -m tools.export_lerobot` makes it on first use")
+        pytest.skip("needs lerobot's environment")
     found = subprocess.run([uv, "python", "find", "--script", str(WRITER)], capture_output=True, text=True, check=True)
     return found.stdout.strip()
 

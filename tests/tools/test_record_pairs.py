@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-cv2 = pytest.importorskip("cv2", reason="needs the camera extra")
-pytest.importorskip("pyrealsense2", reason="needs the camera extra and libusb-1.0-0", exc_type=ImportError)
-pytest.importorskip("franky", reason="needs pip install mpc_sgft[franka]")
-pytest.importorskip("franky_sim", reason="needs pip install mpc_sgft[franka-sim]")
+cv2 = pytest.importorskip("cv2", reason="needs the camera's packages")
+pytest.importorskip("pyrealsense2", reason="needs the camera's packages", exc_type=ImportError)
+pytest.importorskip("franky", reason="needs the robot's client")
+pytest.importorskip("franky_sim", reason="needs the robot's client")
 
 from envs.kinematics import tip_position  # noqa: E402
 from envs.stand_in.client import StandIn  # noqa: E402

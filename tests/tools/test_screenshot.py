@@ -9,7 +9,7 @@ import pytest
 import rerun as rr
 from PIL import Image
 
-from tools.screenshot import NO_DRIVER, ScreenshotError, main, open_viewer, screenshot
+from tools.screenshot import NO_DRIVER, main, open_viewer, screenshot
 
 ROOT = Path(__file__).parents[2]
 
@@ -28,40 +28,28 @@ def rrd(tmp_path) -> Path:
     return path
 
 
-def skip_without_driver(error: ScreenshotError) -> None:
-    if str(error) == NO_DRIVER:
-        pytest.skip(NO_DRIVER)
-    raise error
-
-
-def test_the_picture_has_the_size_and_the_time_asked_for(rrd, tmp_path):
+def test_the_picture_has_the_size_and_the_time_asked_for(viewer_draws, rrd, tmp_path):
     middle = {}
     for step in (1, 9):
         png = tmp_path / f"{step}.png"
-        try:
-            assert screenshot(rrd, png, at=("env_step", str(step)), size=(640, 400), settle=1.0) == []
-        except ScreenshotError as error:
-            skip_without_driver(error)
+        assert screenshot(rrd, png, at=("env_step", str(step)), size=(640, 400), settle=1.0) == []
         picture = Image.open(png)
         assert picture.size == (640, 400)
         middle[step] = np.asarray(picture)[200, 150].mean()  # left of the viewer's own notices
     assert middle[9] - middle[1] > 150
 
 
-def test_the_viewer_listens_on_loopback_only_and_is_gone_afterwards(rrd):
+def test_the_viewer_listens_on_loopback_only_and_is_gone_afterwards(viewer_draws, rrd):
     before = set(psutil.Process().children(recursive=True))  # this process may have others, of other tests
-    try:
-        with open_viewer(rrd):
-            children = [p for p in psutil.Process().children(recursive=True) if p not in before]
-            listening = [c.laddr.ip for p in children for c in p.net_connections() if c.status == psutil.CONN_LISTEN]
-            assert listening and set(listening) == {"127.0.0.1"}
-    except ScreenshotError as error:
-        skip_without_driver(error)
+    with open_viewer(rrd):
+        children = [p for p in psutil.Process().children(recursive=True) if p not in before]
+        listening = [c.laddr.ip for p in children for c in p.net_connections() if c.status == psutil.CONN_LISTEN]
+        assert listening and set(listening) == {"127.0.0.1"}
     gone, alive = psutil.wait_procs(children, timeout=10)
     assert not [p for p in alive if p.status() != psutil.STATUS_ZOMBIE]
 
 
-def test_mistakes_get_one_clear_line_and_exit_code_2(rrd, tmp_path, capsys):
+def test_mistakes_get_one_clear_line_and_exit_code_2(viewer_draws, rrd, tmp_path, capsys):
     png = str(tmp_path / "out.png")
     junk = tmp_path / "junk.rrd"
     junk.write_text("no recording")
@@ -75,8 +63,6 @@ def test_mistakes_get_one_clear_line_and_exit_code_2(rrd, tmp_path, capsys):
     for arguments, message in cases:
         assert main(arguments) == 2
         said = capsys.readouterr().err
-        if NO_DRIVER in said:
-            pytest.skip(NO_DRIVER)
         assert message in said and "Traceback" not in said
     for wrong in (["--time", "env_step"], ["--size", "big"]):
         with pytest.raises(SystemExit) as stopped:

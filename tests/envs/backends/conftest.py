@@ -32,8 +32,8 @@ def robot_config() -> dict:
 
 @pytest.fixture
 def stand_in(robot_push: Push) -> Iterator[StandIn]:
-    pytest.importorskip("franky", reason="needs pip install mpc_sgft[franka]")
-    pytest.importorskip("franky_sim", reason="needs pip install mpc_sgft[franka-sim]")
+    pytest.importorskip("franky", reason="needs the robot's client")
+    pytest.importorskip("franky_sim", reason="needs the robot's client")
     running = StandIn(robot_push)
     yield running
     running.close()

@@ -4,7 +4,7 @@ import pytest
 
 from envs.backends.arm_errors import explain, not_ready
 
-franky = pytest.importorskip("franky", reason="the robot's client is an extra: make robot")
+franky = pytest.importorskip("franky", reason="needs the robot's client")
 
 
 @pytest.mark.parametrize(

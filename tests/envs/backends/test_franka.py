@@ -73,7 +73,7 @@ def test_a_second_client_is_told_so(robot: FrankaBackend, stand_in: StandIn, rob
 
 
 def test_nobody_at_the_address(robot_config: dict) -> None:
-    pytest.importorskip("franky", reason="needs pip install mpc_sgft[franka]")
+    pytest.importorskip("franky", reason="needs the robot's client")
     began = time.monotonic()
     with pytest.raises(BackendError, match="no robot answers at 127.77.77.77"):
         Arm("127.77.77.77", **robot_config["arm"]).connect()

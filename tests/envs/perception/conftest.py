@@ -78,7 +78,7 @@ def calibration(tmp_path: Path) -> Callable[..., str]:
 def film(tmp_path: Path) -> Callable[..., str]:
     """film(serial, color [n, H, W, 3], depth [n, H, W] m or None, late_ms=0): path of a .db3 recording by librealsense,
     30 frames a second, the depth taken `late_ms` after the picture (tests/film.py)."""
-    pytest.importorskip("pyrealsense2", reason="needs the camera extra and libusb-1.0-0", exc_type=ImportError)
+    pytest.importorskip("pyrealsense2", reason="needs the camera's packages", exc_type=ImportError)
 
     def record(serial: str, color: np.ndarray, depth: np.ndarray | None, late_ms: float = 0.0) -> str:
         path, pictures = tmp_path / f"{serial}.db3", {"color": color}

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-pytest.importorskip("cv2", reason="needs the camera extra")
+pytest.importorskip("cv2", reason="needs the camera's packages")
 
 from envs.perception.aruco import SQUARE, ArucoTag, tag_pose  # noqa: E402
 from envs.perception.camera import Frame  # noqa: E402

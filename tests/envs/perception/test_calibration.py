@@ -61,7 +61,7 @@ def test_another_camera_or_lens_is_refused():
 
 @pytest.mark.parametrize("model", MODELS)
 def test_rays_are_those_of_librealsense(model):
-    rs = pytest.importorskip("pyrealsense2", reason="needs the camera extra and libusb-1.0-0", exc_type=ImportError)
+    rs = pytest.importorskip("pyrealsense2", reason="needs the camera's packages", exc_type=ImportError)
     bend = (0.12, -0.25, 0.001, -0.0006, 0.08) if model != "none" else (0.0,) * 5
     mine = Intrinsics(width=640, height=480, fx=610.0, fy=611.0, cx=322.0, cy=241.0, model=model, coefficients=bend)
     its = rs.intrinsics()

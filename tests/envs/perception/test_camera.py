@@ -6,7 +6,7 @@ import sys
 import numpy as np
 import pytest
 
-rs = pytest.importorskip("pyrealsense2", reason="needs the camera extra and libusb-1.0-0", exc_type=ImportError)
+rs = pytest.importorskip("pyrealsense2", reason="needs the camera's packages", exc_type=ImportError)
 
 from envs.perception.base import PerceptionError  # noqa: E402
 from envs.perception.camera import RealSense  # noqa: E402

@@ -74,7 +74,7 @@ def test_a_calibration_of_another_camera_is_refused(table, film, calibration):
 
 
 def test_settings_that_do_not_fit_are_named(calibration):
-    pytest.importorskip("cv2", reason="needs the camera extra")
+    pytest.importorskip("cv2", reason="needs the camera's packages")
     one = calibration("40", np.eye(4))
     for changes, message in (
         ({"calibrations": []}, "a file of each camera"),

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-pytest.importorskip("cv2", reason="needs the camera extra")
+pytest.importorskip("cv2", reason="needs the camera's packages")
 
 from envs.perception.camera import Frame  # noqa: E402
 from envs.perception.color import ColorBlob  # noqa: E402

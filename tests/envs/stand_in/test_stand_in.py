@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-pytest.importorskip("franky", reason="needs pip install mpc_sgft[franka]")
-pytest.importorskip("franky_sim", reason="needs pip install mpc_sgft[franka-sim]")
+pytest.importorskip("franky", reason="needs the robot's client")
+pytest.importorskip("franky_sim", reason="needs the robot's client")
 ROOT = Path(__file__).resolve().parents[3]
 
 

@@ -48,7 +48,7 @@ def test_one_line_for_each_mistake(given: tuple[str, ...], words: str) -> None:
     ],
 )
 def test_numbers_that_need_the_client(given: str, words: str) -> None:
-    pytest.importorskip("franky", reason="needs pip install mpc_sgft[franka]")
+    pytest.importorskip("franky", reason="needs the robot's client")
     with pytest.raises(UserError, match=words):
         robot.make_env(config("robot-ip=stand-in", given))
 

@@ -15,8 +15,8 @@ import pytest
 from envs.kinematics import tip_position
 from mpc_sgft.storage.episode_file import read_episode
 
-pytest.importorskip("franky", reason="needs pip install mpc_sgft[franka]")
-pytest.importorskip("franky_sim", reason="needs pip install mpc_sgft[franka-sim]")
+pytest.importorskip("franky", reason="needs the robot's client")
+pytest.importorskip("franky_sim", reason="needs the robot's client")
 pytestmark = pytest.mark.slow
 DEPLOY = [sys.executable, "-m", "mpc_sgft.deploy"]
 STEPS = 8

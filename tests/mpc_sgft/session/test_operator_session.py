@@ -21,8 +21,8 @@ import pytest
 
 from mpc_sgft.storage.episode_file import read_episode
 
-pytest.importorskip("franky", reason="needs pip install mpc_sgft[franka]")
-pytest.importorskip("franky_sim", reason="needs pip install mpc_sgft[franka-sim]")
+pytest.importorskip("franky", reason="needs the robot's client")
+pytest.importorskip("franky_sim", reason="needs the robot's client")
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
 STEPS = 8
 PATIENT = ["backend.limits.state_age=5", "backend.limits.detection_age=5", "backend.patience=5"]  # on a busy computer

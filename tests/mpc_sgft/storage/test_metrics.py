@@ -97,7 +97,7 @@ def test_wandb_missing_says_what_to_do(tmp_path, monkeypatch):
 
 
 def test_wandb_gets_the_same_rows(tmp_path, monkeypatch):
-    wandb = pytest.importorskip("wandb", reason="needs the extra wandb")
+    wandb = pytest.importorskip("wandb", reason="needs wandb")
     monkeypatch.setenv("WANDB_MODE", "offline")
     monkeypatch.setenv("WANDB_SILENT", "true")
     with MetricLogger(tmp_path, csv=False, tensorboard=False, wandb=True, resume_step=4) as logger:

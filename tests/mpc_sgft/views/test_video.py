@@ -8,17 +8,14 @@ from itertools import pairwise
 
 import imageio.v2 as imageio
 import numpy as np
-import pytest
 
 COMMAND = [sys.executable, "-m", "mpc_sgft.evaluate", "policy=scripted", "episodes=1", "video=true"]
 
 
-def test_a_film_shows_every_step_of_the_episode(tmp_path):
+def test_a_film_shows_every_step_of_the_episode(mujoco_gl, tmp_path):
     run = tmp_path / "run"
-    environment = os.environ | {"MUJOCO_GL": "egl"}
+    environment = os.environ | {"MUJOCO_GL": mujoco_gl}
     done = subprocess.run([*COMMAND, f"run_dir={run}"], capture_output=True, text=True, env=environment, timeout=120)
-    if "cannot draw here" in done.stderr:
-        pytest.skip(done.stderr.strip())
     assert done.returncode == 0, done.stderr
     frames = imageio.mimread(json.loads((run / "summary.json").read_text())["video"], memtest=False)
     assert len(frames) == 40 and frames[0].shape == (480, 640, 3)

@@ -13,7 +13,7 @@ from mpc_sgft.views.blueprint import Layout, camera
 from mpc_sgft.views.episode_view import Candidates, EpisodeView
 from mpc_sgft.views.value_image import viridis
 from mpc_sgft.views.viewer import RunViewer
-from tools.screenshot import NO_DRIVER, ScreenshotError, open_viewer, reports, set_time
+from tools.screenshot import open_viewer, reports, set_time
 
 ROOT = Path(__file__).parents[3]
 ARM = """
@@ -290,21 +290,16 @@ def test_an_episode_costs_milliseconds(tmp_path, arm):
         assert (time.perf_counter() - start) / 5 < 0.5  # measured 0.02 s for 40 steps and 20 times 256 candidates
 
 
-def test_the_viewer_warns_about_nothing(tmp_path, arm):
+def test_the_viewer_warns_about_nothing(viewer_draws, tmp_path, arm):
     """Opens the file in the real viewer, without a screen, and walks through it."""
     write(tmp_path / "run.rrd", arm)
-    try:
-        with open_viewer(tmp_path / "run.rrd") as client:
-            for step in (2, T, 2 * T):
-                set_time(client, "env_step", str(step))
-                client.save_screenshot(str(tmp_path / "shot.png"))  # so that every view has been drawn
-                assert reports(client) == []
-            views = client.get_state().views
-            logged = set(client.get_recording_schema().timelines[i].name for i in range(2))
-    except ScreenshotError as error:
-        if str(error) == NO_DRIVER:
-            pytest.skip(NO_DRIVER)
-        raise
+    with open_viewer(tmp_path / "run.rrd") as client:
+        for step in (2, T, 2 * T):
+            set_time(client, "env_step", str(step))
+            client.save_screenshot(str(tmp_path / "shot.png"))  # so that every view has been drawn
+            assert reports(client) == []
+        views = client.get_state().views
+        logged = set(client.get_recording_schema().timelines[i].name for i in range(2))
     assert Counter(view.view_class for view in views) == {
         "3D": 2, "2D": 2, "TimeSeries": 5, "TextLog": 1
     }  # fmt: skip

@@ -11,8 +11,8 @@ from tools.studies import endure, nightly_franka_sim
 
 @pytest.mark.slow
 def test_resets_and_steps_are_counted(tmp_path: Path, capsys) -> None:
-    pytest.importorskip("franky", reason="needs pip install mpc_sgft[franka]")
-    pytest.importorskip("franky_sim", reason="needs pip install mpc_sgft[franka-sim]")
+    pytest.importorskip("franky", reason="needs the robot's client")
+    pytest.importorskip("franky_sim", reason="needs the robot's client")
     out = tmp_path / "new" / "endure.json"
     assert endure.main(["--resets", "2", "--steps", "5", "--out", str(out)]) == 0
     found = json.loads(out.read_text())
@@ -23,8 +23,8 @@ def test_resets_and_steps_are_counted(tmp_path: Path, capsys) -> None:
 @pytest.mark.slow
 def test_an_abort_is_named_and_ends_with_1(tmp_path: Path) -> None:
     """An object that is always too old to count as seen: no episode can begin, and it gives up."""
-    pytest.importorskip("franky", reason="needs pip install mpc_sgft[franka]")
-    pytest.importorskip("franky_sim", reason="needs pip install mpc_sgft[franka-sim]")
+    pytest.importorskip("franky", reason="needs the robot's client")
+    pytest.importorskip("franky_sim", reason="needs the robot's client")
     out = tmp_path / "endure.json"
     blind = ["--set", "backend.limits.detection_age=1e-9", "backend.patience=0.01", "backend.reset_speed=0.4"]
     assert endure.main(["--resets", "5", "--steps", "5", "--out", str(out), *blind]) == 1
@@ -44,7 +44,7 @@ def test_an_abort_is_named_and_ends_with_1(tmp_path: Path) -> None:
     ],
 )
 def test_what_cannot_be_is_one_line_and_2(words: list[str], said: str, tmp_path: Path, capsys) -> None:
-    pytest.importorskip("franky", reason="needs pip install mpc_sgft[franka]")
+    pytest.importorskip("franky", reason="needs the robot's client")
     assert endure.main([*words, "--out", str(tmp_path / "x.json")]) == 2
     error = capsys.readouterr().err
     assert said in error and error.count("\n") == 1 and not (tmp_path / "x.json").exists(), error
