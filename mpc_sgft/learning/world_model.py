@@ -83,11 +83,14 @@ class WorldModel(nn.Module):
         latent_dim: Entries of the code that the encoder makes, a multiple of simnorm_dim.
         memory_dim: Last entries of the observation, past actions newest first, that the latent carries as they are. A
             latent then has D = latent_dim + memory_dim entries, and the dynamics need not learn to remember.
-        mlp_dim, enc_dim: Hidden sizes of the heads and of the encoder.
+        mlp_dim: Hidden size of the heads.
+        enc_dim: Hidden size of the encoder.
         enc_layers: Hidden layers of the encoder.
         num_q: Members of the critic ensemble [E].
         simnorm_dim: Entries of one SimNorm group.
-        num_bins, vmin, vmax: Two-hot bins of reward and value, on a symlog scale.
+        num_bins: Two-hot bins of reward and value.
+        vmin: Lowest bin, on a symlog scale.
+        vmax: Highest bin.
         dropout: Probability on the first layer of every critic while training.
         reward_from: "next": reward is read from the latent it is received in, so that it cannot hide the simulator's
             dynamics; "current": from (z, a), as TD-MPC2 has it.

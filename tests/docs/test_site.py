@@ -1,0 +1,32 @@
+"""What the hooks of the documentation make, and that every page they speak of is there."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from tools import docs_hooks
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def test_every_fill_leaves_no_mark_behind() -> None:
+    text = docs_hooks.on_page_markdown("{{ results }}\n{{ settings }}\n{{ effects }}")
+    assert (
+        "{{ results" not in text and "`turned`" in text and "`stribeck_friction`" in text and "num_elites: 96" in text
+    )
+
+
+def test_equations_become_mathml() -> None:
+    html = docs_hooks.on_page_content('<p><span class="arithmatex">\\(a &lt; b_t\\)</span></p>')
+    assert html.startswith("<p><math") and "&lt;" in html or "&#x0003C;" in html
+
+
+def test_links_between_pages_lead_somewhere() -> None:
+    """`make docs` is strict about it, too; this needs no generator."""
+    wrong = []
+    for page in (ROOT / "docs").rglob("*.md"):
+        for target in re.findall(r"\]\((?!https?:|#)([^)#]+)", page.read_text()):
+            if not (page.parent / target).exists():
+                wrong.append(f"{page.relative_to(ROOT)}: {target}")
+    assert not wrong

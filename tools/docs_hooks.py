@@ -1,0 +1,76 @@
+"""What MkDocs fills in while it builds: results, settings, effects, equations. Nothing of these is typed twice."""
+
+import re
+import shutil
+from pathlib import Path
+from typing import Any
+
+import yaml
+from latex2mathml.converter import convert
+
+from mpc_sgft.command import choices
+from tools import results_page
+
+ROOT = Path(__file__).resolve().parents[1]
+MATH = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>', re.DOTALL)
+
+
+def on_pre_build(config: Any) -> None:
+    """Copy the pictures of results/ to where the page looks for them."""
+    pictures = Path(config["docs_dir"]) / "results"
+    shutil.rmtree(pictures, ignore_errors=True)
+    for png in sorted(results_page.RESULTS.glob("*/*.png")):
+        (pictures / png.parent.name).mkdir(parents=True, exist_ok=True)
+        shutil.copy(png, pictures / png.parent.name / png.name)
+
+
+def on_page_markdown(markdown: str, **_: Any) -> str:
+    """Fill the places that are marked {{ so }}."""
+    for name, fill in (("results", results_page.page), ("settings", settings), ("effects", effects)):
+        mark = "{{ " + name + " }}"
+        if mark in markdown:
+            markdown = markdown.replace(mark, fill())
+    return markdown
+
+
+def on_page_content(html: str, **_: Any) -> str:
+    """Equations become MathML, which browsers draw themselves."""
+    return MATH.sub(lambda m: convert(_plain(m[2]), display="block" if m[1] == "div" else "inline"), html)
+
+
+def _plain(tex: str) -> str:
+    return tex.replace("&lt;", "<").replace("&gt;", ">").replace("&amp;", "&").strip()
+
+
+def settings() -> str:
+    """Every yaml of configs/ but the gaps, with its comments: the one place where a number lives."""
+    parts = []
+    for group, names in choices.groups().items():
+        if group == "gap":
+            continue
+        parts.append(f"### {group}\n\n{group}= " + ", ".join(f"`{name}`" for name in names))
+        for name in names:
+            text = (choices.CONFIG_DIR / group / f"{name}.yaml").read_text().rstrip()
+            parts.append(f'??? note "`configs/{group}/{name}.yaml`"\n\n    ```yaml\n' + _indent(text) + "\n    ```")
+    rows = []
+    for path in sorted((choices.CONFIG_DIR / "gap").glob("*.yaml")):
+        what = yaml.safe_load(path.read_text()).get("effects") or {}
+        rows.append([f"`{path.stem}`", "; ".join(f"{k} {v}" for k, v in what.items()).replace("|", "\\|") or "nothing"])
+    return "\n\n".join([*parts, "### gap", results_page.table(["gap=", "what is hidden"], rows)])
+
+
+def _indent(text: str) -> str:
+    return "\n".join("    " + line if line else "" for line in text.splitlines())
+
+
+def effects() -> str:
+    """The effects, by the first line of what each file says of itself."""
+    from importlib import import_module
+
+    from envs.effects import available
+
+    rows = []
+    for name in available():
+        line = (import_module(f"envs.effects.{name}").__doc__ or "").strip().splitlines()[0]
+        rows.append([f"`{name}`", line])
+    return results_page.table(["effect", "what reality has"], rows)

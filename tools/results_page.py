@@ -1,0 +1,231 @@
+"""Tables of results/, for the documentation and the README; none is typed by hand.
+
+    python -m tools.results_page --readme          # rewrite the headline table of README.md
+
+`docs/results.md` is filled when the site is built (tools/docs_hooks.py).
+"""
+
+import argparse
+import csv
+import json
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from statistics import median
+
+ROOT = Path(__file__).resolve().parents[1]
+RESULTS = ROOT / "results"
+BEGIN, END = "<!-- headline:begin -->", "<!-- headline:end -->"
+Row = dict[str, str]
+
+
+def read(path: str) -> list[Row]:
+    """Rows of a CSV of results/."""
+    with (RESULTS / path).open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """A Markdown table."""
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join("| " + " | ".join(str(cell) for cell in line) + " |" for line in lines)
+
+
+def percent(value: str | float) -> str:
+    return f"{100 * float(value):.0f} %"
+
+
+def spread(values: Sequence[float]) -> str:
+    """Median, and lowest to highest where there are several, of shares."""
+    middle = f"{100 * median(values):.0f}"
+    return f"{middle} % ({100 * min(values):.0f}–{100 * max(values):.0f})" if len(set(values)) > 1 else f"{middle} %"
+
+
+def curves(rows: list[Row], key: Callable[[Row], str], name: str) -> str:
+    """Success after each number of rollouts, a line a key: median (lowest-highest) over the seeds."""
+    counts = sorted({int(row["rollouts"]) for row in rows})
+    lines = []
+    for group in dict.fromkeys(map(key, rows)):
+        mine = [row for row in rows if key(row) == group]
+        seeds = len({row["seed"] for row in mine})
+        cells = [[float(r["success"]) for r in mine if int(r["rollouts"]) == n] for n in counts]
+        lines.append([group, seeds, *(spread(values) if values else "" for values in cells)])
+    return table([name, "seeds", *(f"{n} rollouts" for n in counts)], lines)
+
+
+def pick(rows: list[Row], columns: dict[str, str | tuple[str, Callable[[str], str]]]) -> str:
+    """Some columns of a CSV as they are, {heading: column or (column, how to write it)}."""
+    how = {head: what if isinstance(what, tuple) else (what, str) for head, what in columns.items()}
+    return table(list(how), [[write(row[name]) if row[name] else "" for name, write in how.values()] for row in rows])
+
+
+def pretrain() -> str:
+    head = {
+        "seed": "seed",
+        "episodes": "episodes_evaluated",
+        "success": ("success", tenth),
+        "low": ("success_low", tenth),
+    }
+    head |= {"high": ("success_high", tenth), "prior": ("prior_success", percent), "minutes": ("wall_seconds", minutes)}
+    return "\n\n".join(
+        f"{name}\n\n{pick(read(f'pretrain/{file}.csv'), head)}"
+        for name, file in (("From scratch:", "pretrain"), ("The second stage (`+experiment=polish`):", "polish"))
+    )
+
+
+def tenth(value: str) -> str:
+    return f"{100 * float(value):.1f} %"
+
+
+def minutes(value: str) -> str:
+    return f"{float(value) / 60:.1f}"
+
+
+def digits(value: str) -> str:
+    return f"{float(value):.4g}"
+
+
+def transfer() -> str:
+    rows = read("transfer/sgft.csv") + read("transfer/tdmpc2.csv")
+    return curves(rows, lambda r: f"`{r['gap']}`, {r['method']}", "gap and method")
+
+
+def blind() -> str:
+    rows = [r for r in read("blind/blind.csv") if r["method"] == "diagnose"]
+    lines = [[r["score"], r["goal"], f"{percent(r['value'])} [{percent(r['low'])}, {percent(r['high'])}]", r["of"]]
+             for r in rows]  # fmt: skip
+    others = [r for r in read("blind/blind.csv") if r["score"] in ("single, clear: top 1", "no effect: false alarms")]
+    by = {
+        m: [percent(r["value"]) for r in others if r["method"] == m] for m in dict.fromkeys(r["method"] for r in others)
+    }
+    simple = table(["method", "clear single effects: top 1", "false alarms"], [[m, *cells] for m, cells in by.items()])
+    return table(["asked", "goal", "measured", "cases"], lines) + "\n\nBeside simpler ways:\n\n" + simple
+
+
+def loop() -> str:
+    head = {
+        "gap": "gap",
+        "seed": "seed",
+        "zero-shot": ("zero_shot_before", percent),
+        "after": ("zero_shot_after", percent),
+    }
+    head |= {"30 rollouts": ("final_before", percent), "after ": ("final_after", percent)}
+    head |= {"rollouts to 95 %": "rollouts_to_95_before", "after  ": "rollouts_to_95_after"}
+    named = {"gap": "gap", "seed": "seed", "effect": "effect", "parameter": "parameter", "value": ("value", digits)}
+    parts = [pick(read("close_the_loop/close_the_loop.csv"), head)]
+    for file, says in (("diagnose_run", "What was named"), ("diagnose_run_again", "With the later solver")):
+        parts.append(f"{says}:\n\n{pick(read(f'close_the_loop/{file}.csv'), named)}")
+    dev = {name: name for name in ("gap", "imagined_steps", "hold_value", "transitions", "zero_shot_success")}
+    return "\n\n".join([*parts, f"Ways to retrain:\n\n{pick(read('close_the_loop/retrain_dev.csv'), dev)}"])
+
+
+def timing() -> str:
+    plan = {name: name for name in ("what", "size", "horizon", "rows", "threads")}
+    plan = {**plan, "median ms": "median_ms", "share of peak": "share_of_peak", "to upstream": "ratio_to_upstream"}
+    diagnose = {"what": "what", "s of data": "seconds_of_data", "names": "names", "wall s": "wall_s", "per unit": "per"}
+    env = {"what": "what", "physics steps / s": "physics_steps_per_s", "ControlEnv / this": "control_env_over_this"}
+    pairs = (("time_planner", plan), ("time_diagnose", diagnose), ("benchmark_env", env))
+    return "\n\n".join(pick(read(f"timing/{file}.csv"), columns) for file, columns in pairs)
+
+
+def records(*paths: str) -> str:
+    """JSON files side by side, plain values only."""
+    files = [json.loads((RESULTS / path).read_text()) for path in paths]
+    flat = [{**d, **(d.get("robot") or {})} for d in files]
+    leave = ("command", "cpu", "platform", "rrd", "frozen_sha256", "seed", "method", "task", "gap")
+    keys = [k for k in dict.fromkeys(k for d in flat for k in d) if k not in leave]
+    plain = [k for k in keys if not any(isinstance(d.get(k), dict | list) and d.get(k) for d in flat)]
+    names = [Path(path).stem for path in paths]
+    return table(["", *names], [[k, *(d.get(k, "") if d.get(k) is not None else "" for d in flat)] for k in plain])
+
+
+def emps() -> str:
+    head = {"data": "what", "verdict": "verdict", "named": "effects", "first half mm": "first_mm"}
+    return pick(read("emps/emps.csv"), {**head, "second mm": "second_mm", "pulses mm": "pulses_mm", "s": "seconds"})
+
+
+def critic() -> str:
+    head = {"critic": "critic", "puck at x [m]": "puck_x_m", "V": "value", "return": "return"}
+    return pick(read("critic_profile/critic_profile.csv"), head)
+
+
+def exact() -> str:
+    head = {"gap": "gap", "H": "horizon", "reward": "reward", "episodes": "episodes", "success": ("success", percent)}
+    return pick(read("exact_dynamics/exact_dynamics.csv"), head)
+
+
+STUDIES: dict[str, Callable[[], str]] = {
+    "pretrain": pretrain,
+    "transfer": transfer,
+    "no_harm": lambda: curves(read("no_harm/no_harm.csv"), lambda r: r["variant"] or "all of it", "variant"),
+    "horizon": lambda: curves(read("horizon/horizon.csv"), lambda r: r["variant"], "variant"),
+    "pendulum": lambda: curves(read("pendulum/pendulum.csv"), lambda r: r["method"], "method"),
+    "critic_profile": critic,
+    "exact_dynamics": exact,
+    "blind": blind,
+    "emps": emps,
+    "close_the_loop": loop,
+    "stand_in": lambda: records("stand_in/stand_in.json", "stand_in/zero_shot.json"),
+    "endure": lambda: records("endure/endure.json"),
+    "franka_sim": lambda: records("franka_sim/franka_sim.json"),
+    "stability": lambda: records("stability/stability.json"),
+    "timing": timing,
+}
+
+
+def study(name: str) -> str:
+    """A section of the page: what the study's README says, its tables and pictures."""
+    text = (RESULTS / name / "README.md").read_text()
+    title, _, rest = text.removeprefix("# ").partition("\n")
+    prose, _, facts = rest.partition("\n- command:")
+    pictures = [f"![{p.stem}](results/{name}/{p.name})" for p in sorted((RESULTS / name).glob("*.png"))]
+    parts = [f"## {title} {{ #{name} }}", prose.strip(), STUDIES[name](), *pictures, "- command:" + facts.strip("\n")]
+    return "\n\n".join(parts)
+
+
+def page() -> str:
+    """All studies, as Markdown."""
+    return "\n\n".join(study(name) for name in STUDIES)
+
+
+def headline() -> str:
+    """The table of the README."""
+    scratch = [float(row["success"]) for row in read("pretrain/pretrain.csv")]
+    took = [float(row["wall_seconds"]) / 60 for row in read("pretrain/pretrain.csv")]
+    rows = [["push, pretrained", f"{spread(scratch)} in {median(took):.0f} min", "pretrain"]]
+    runs = read("transfer/sgft.csv")
+    for gap in dict.fromkeys(row["gap"] for row in runs):
+        after = [
+            [float(r["success"]) for r in runs if r["gap"] == gap and r["rollouts"] == n] for n in ("0", "10", "30")
+        ]
+        text = " → ".join(spread(values) for values in after)
+        rows.append([f"`{gap}`: 0 → 10 → 30 rollouts", text, "transfer"])
+    score = {r["score"]: r for r in read("blind/blind.csv") if r["method"] == "diagnose"}
+    top, false = score["single, clear: top 1"], score["no effect: false alarms"]
+    rows.append(["diagnose, blind: right name", f"{percent(top['value'])} of {top['of']}", "blind"])
+    rows.append(["diagnose, blind: false alarms", f"{percent(false['value'])} of {false['of']}", "blind"])
+    closed = read("close_the_loop/close_the_loop.csv")
+    before, after = ([float(r[f"zero_shot_{when}"]) for r in closed] for when in ("before", "after"))
+    rows.append(["diagnosed and retrained: zero-shot", f"{spread(before)} → {spread(after)}", "close_the_loop"])
+    lines = [[what, value, f"[data](results/{where}/)"] for what, value, where in rows]
+    return table(["What", "Success, median (lowest–highest)", ""], lines)
+
+
+def write_readme(path: Path) -> None:
+    """Put the headline table between its markers."""
+    text = path.read_text()
+    start, end = text.index(BEGIN) + len(BEGIN), text.index(END)
+    path.write_text(f"{text[:start]}\n{headline()}\n{text[end:]}")
+
+
+def main() -> None:
+    assert __doc__ is not None
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--readme", action="store_true", help="rewrite the table of README.md instead of printing")
+    if parser.parse_args().readme:
+        write_readme(ROOT / "README.md")
+    else:
+        print(page())
+
+
+if __name__ == "__main__":
+    main()
