@@ -197,16 +197,16 @@ def headline() -> str:
         after = [
             [float(r["success"]) for r in runs if r["gap"] == gap and r["rollouts"] == n] for n in ("0", "10", "30")
         ]
-        text = " → ".join(spread(values) for values in after)
-        rows.append([f"`{gap}`: 0 → 10 → 30 rollouts", text, "transfer"])
+        text = " → ".join(spread(values).replace(" %", "") for values in after) + " %"
+        rows.append([f"`{gap}`, 0 → 10 → 30 rollouts", text, "transfer"])
     score = {r["score"]: r for r in read("blind/blind.csv") if r["method"] == "diagnose"}
     top, false = score["single, clear: top 1"], score["no effect: false alarms"]
-    rows.append(["diagnose, blind: right name", f"{percent(top['value'])} of {top['of']}", "blind"])
-    rows.append(["diagnose, blind: false alarms", f"{percent(false['value'])} of {false['of']}", "blind"])
+    rows.append(["diagnose, right name", f"{percent(top['value'])} of {top['of']}", "blind"])
+    rows.append(["diagnose, false alarms", f"{percent(false['value'])} of {false['of']}", "blind"])
     closed = read("close_the_loop/close_the_loop.csv")
     before, after = ([float(r[f"zero_shot_{when}"]) for r in closed] for when in ("before", "after"))
-    rows.append(["diagnosed and retrained: zero-shot", f"{spread(before)} → {spread(after)}", "close_the_loop"])
-    lines = [[what, value, f"[data](results/{where}/)"] for what, value, where in rows]
+    rows.append(["zero-shot once diagnosed", f"{spread(before)} → {spread(after)}".replace(" %", "") + " %", "close_the_loop"])
+    lines = [[what, value, f"[data](results/{where})"] for what, value, where in rows]
     return table(["What", "Success, median (lowest–highest)", ""], lines)
 
 
