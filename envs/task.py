@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+Point = tuple[float, float, float]
 
 
 class Start(NamedTuple):
@@ -16,6 +17,56 @@ class Start(NamedTuple):
     qpos: Array  # [n, nq]
     qvel: Array  # [n, nv]
     target: Array  # [n, C], the controller's first command
+
+
+class Arm(NamedTuple):
+    """What the robot backend must know of a task on the FR3.
+
+    Attributes:
+        rest: Posture to which the redundant joint is drawn, [7] rad.
+        tool_length: From the flange to the tool's tip, [m].
+    """
+
+    rest: Array
+    tool_length: float
+
+
+class View(NamedTuple):
+    """Where the viewer's cameras stand, and how large the object's ghost is; None leaves it to the viewer.
+
+    Attributes:
+        eye: Where the camera stands, [m].
+        target: What it looks at, [m].
+        second_eye: The same of the view that shows paths without the machine, [m].
+        second_target: What it looks at, [m].
+        object_radius: Of the object's ghost, a cylinder, [m].
+        object_height: Of the same, [m].
+    """
+
+    eye: Point | None = None
+    target: Point | None = None
+    second_eye: Point | None = None
+    second_target: Point | None = None
+    object_radius: float = 0.03
+    object_height: float = 0.02
+
+
+class ValuePlane(NamedTuple):
+    """Two quantities over which the value of a state is drawn as a map.
+
+    Attributes:
+        observation: At each point of a G by G' grid, the first quantity varying slowest, [G G', O].
+        shape: (G, G').
+        extent: First quantity from, to, second from, to.
+        axes: Name and unit of each.
+        marks: Named places to mark.
+    """
+
+    observation: Array
+    shape: tuple[int, int]
+    extent: tuple[float, float, float, float]
+    axes: tuple[tuple[str, str], tuple[str, str]]
+    marks: dict[str, tuple[float, float]]
 
 
 def whole_steps(control_dt: float, sim_dt: float) -> int:
@@ -33,6 +84,11 @@ def whole_steps(control_dt: float, sim_dt: float) -> int:
 class AbstractTask(ABC):
     """One task: all arrays have a leading row per environment, all units are SI.
 
+    A task must say its attributes and the abstract methods: the scene, the start, the controller, observation, reward,
+    success and a scripted policy. The rest has a default; say it where it holds: `hold`, `place` and `points` if there
+    is an object or a controller of its own, `view` and `value_plane` for the viewer, `arm`, `place_of` and `qpos_of`
+    for a robot.
+
     Attributes:
         name: As in configs/task/.
         observation_names: One name for each entry of the observation.
@@ -41,6 +97,7 @@ class AbstractTask(ABC):
         control_dt: Seconds between actions.
         sim_dt: Seconds between physics steps.
         moves_in_plane: Whether the first two entries of an action displace the tool along x and y.
+        arm: Of a task that an FR3 can do; None: simulation alone.
     """
 
     name: str
@@ -50,6 +107,7 @@ class AbstractTask(ABC):
     control_dt: float
     sim_dt: float
     moves_in_plane: bool = False
+    arm: Arm | None = None
 
     @abstractmethod
     def spec(self) -> mujoco.MjSpec:
@@ -96,8 +154,30 @@ class AbstractTask(ABC):
         return np.zeros(len(observation), bool)
 
     def points(self, observation: Array) -> dict[str, Array]:
-        """Named points in the world frame, [N, 3] m, that a viewer can draw for an observation; may be empty."""
+        """What a viewer can draw for an observation: `tool`, and `object` if there is one, [N, 3] m in the world frame;
+        empty if nothing can be drawn."""
         return {}
+
+    def view(self) -> View:
+        """How a viewer looks at the scene."""
+        return View()
+
+    def value_plane(self, points: int) -> ValuePlane | None:
+        """Over what the value is drawn as a map of `points` by `points`; None: no map."""
+        return None
+
+    def place_of(self, qpos: Array) -> Array:
+        """Where the object is, base frame, [N, 3] m, for the scene's joint positions [N, nq].
+
+        Raises:
+            ValueError: If the task has no object.
+        """
+        raise ValueError(f"task {self.name} has no object")
+
+    def qpos_of(self, joints: Array, place: Array) -> Array:
+        """The scene's joint positions [N, nq] for the machine's [N, n] and the object's place [N, 3] m, upright."""
+        upright = np.tile([1.0, 0.0, 0.0, 0.0], (len(joints), 1))
+        return np.concatenate([joints, place, upright], 1)
 
     def describe(self) -> str:
         return f"{self.name}: {self.action_dim} actions, observes {', '.join(self.observation_names)}"

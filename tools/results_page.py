@@ -205,7 +205,9 @@ def headline() -> str:
     rows.append(["diagnose, false alarms", f"{percent(false['value'])} of {false['of']}", "blind"])
     closed = read("close_the_loop/close_the_loop.csv")
     before, after = ([float(r[f"zero_shot_{when}"]) for r in closed] for when in ("before", "after"))
-    rows.append(["zero-shot once diagnosed", f"{spread(before)} → {spread(after)}".replace(" %", "") + " %", "close_the_loop"])
+    rows.append(
+        ["zero-shot once diagnosed", f"{spread(before)} → {spread(after)}".replace(" %", "") + " %", "close_the_loop"]
+    )
     lines = [[what, value, f"[data](results/{where})"] for what, value, where in rows]
     return table(["What", "Success, median (lowest–highest)", ""], lines)
 

@@ -42,7 +42,7 @@ class FrankaBackend:
     num_envs = 1
 
     def __init__(self, task: AbstractTask, rig: Rig, *, safe_tip: tuple[float, float, float], reset_speed: float):
-        if not all(hasattr(task, name) for name in ("held", "tool_length", "rest")):
+        if task.arm is None:
             raise ValueError(f"task {task.name} has no FR3: it can run on backend sim alone")
         speed = rig.gate.limits.speed
         if not 0 < reset_speed <= speed / 1.1:
@@ -50,8 +50,8 @@ class FrankaBackend:
         self.task, self.rig, self.gate = task, rig, rig.gate
         self.way = {
             "safe_tip": np.array(safe_tip, float),
-            "rest": task.rest,
-            "tool_length": task.tool_length,
+            "rest": task.arm.rest,
+            "tool_length": task.arm.tool_length,
             "speed": reset_speed,
             "sample_dt": self.gate.sample_dt,
         }
@@ -92,7 +92,7 @@ class FrankaBackend:
         self.open()
         start = self.task.start(self.rng)
         try:
-            seen = self._go_to(start.qpos[0, :7], start.qpos[0, 7:10])
+            seen = self._go_to(start.qpos[0, :7], self.task.place_of(start.qpos)[0])
         except (NotSafe, BackendError) as error:
             self.rig.end()
             raise BackendError(f"the episode cannot begin: {error}. The arm is at rest.") from error
@@ -187,12 +187,12 @@ class FrankaBackend:
     def status(self) -> dict[str, str]:
         """What a person wants to see of the robot now, in words; asks nothing of it, so any thread may call."""
         running, seen = self.rig.running, self.rig.seen
-        found = {"robot": "at rest", "tip": "-", "gripper": self.rig.gripper.words, "object": "not seen yet"}
+        found = {"robot": "at rest", "tool": "-", "gripper": self.rig.gripper.words, "object": "not seen yet"}
         if running is not None:
             state = running.state
             stopped = f", stopped: {running.doubt}" if running.doubt else ""
             found["robot"] = f"{state.mode}{stopped}"
-            found["tip"] = "x {:.3f}  y {:.3f}  z {:.3f} m".format(*self.gate.tip(state.q))
+            found["tool"] = "x {:.3f}  y {:.3f}  z {:.3f} m".format(*self.gate.tip(state.q))
         if seen is not None:
             age = time.monotonic() - seen.time
             found["object"] = "x {:.3f}  y {:.3f} m, seen {:.1f} s ago".format(*seen.position[:2], age)
@@ -229,7 +229,7 @@ class FrankaBackend:
         self.note = f"limited: {step.note[0]}"
         self.counters["limited"] += 1
         self.told = step.path[:, -1].copy()
-        self.target = self.task.held(self._qpos(self.told[0]))
+        self.target = self.task.hold(self.told)
         return asked * step.share[0]
 
     def _stop(self, why: str, sent: Array) -> Outcome:
@@ -252,11 +252,11 @@ class FrankaBackend:
     def _observe(self, seen: Detection) -> Array:
         self._object = np.asarray(seen.position, float)
         self._qshown = self._qpos(self.rig.stream.state.q)
-        return self.task.observe(self._qshown, np.zeros((1, 13)))
+        return self.task.observe(self._qshown, np.zeros((1, self.model.nv)))
 
     def _qpos(self, q: Array) -> Array:
-        """The task's qpos [1, 14] for joint angles and the object last seen."""
-        return np.concatenate([q, self._object, [1.0, 0.0, 0.0, 0.0]])[None]
+        """The task's qpos [1, nq] for joint angles [7] and the object last seen."""
+        return self.task.qpos_of(q[None], self._object[None])
 
     def _outcome(self, sent: Array, *, invalid: bool) -> Outcome:
         seen = self._observation

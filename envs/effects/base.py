@@ -110,7 +110,7 @@ class Effect:
 @cache
 def available() -> tuple[str, ...]:
     """Names of the effects, which are the names of the files in this folder."""
-    here = sys.modules[__package__].__path__
+    here = sys.modules["envs.effects"].__path__
     return tuple(sorted(m.name for m in pkgutil.iter_modules(here) if m.name not in ("base", "passive")))
 
 

@@ -26,7 +26,7 @@ class StandIn:
     """A running stand-in, seen as a Perception: a child process that ends with this one, whatever ends it.
 
     Args:
-        task: What stands on its table.
+        task: What stands in its scene.
 
     Attributes:
         ip: Where the robot answers.
@@ -83,7 +83,7 @@ class StandIn:
 
 
 class Scene:
-    """The stand-in's table: a Perception, and a hand that puts the object somewhere.
+    """The stand-in's scene: a Perception, and a hand that puts the object somewhere.
 
     Args:
         port: Of its socket on 127.0.0.1.

@@ -1,4 +1,4 @@
-"""The task's table and objects, and its tool, in the scene of franky-sim: its arm, our things."""
+"""What the task has around the arm, its object and its tool, in the scene of franky-sim: its arm, our things."""
 
 from xml.etree.ElementTree import Element, SubElement
 

@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.task import AbstractTask, Array, Start, whole_steps
+from envs.task import AbstractTask, Array, Start, ValuePlane, View, whole_steps
 
 MASS, LENGTH, DAMPING = 1.0, 1.0, 0.05  # [kg], [m], [N m s/rad]
 
@@ -89,3 +89,14 @@ class Pendulum(AbstractTask):
         balance = -(2.0 * gravity * sin + 6.0 * velocity)
         torque = np.where(cos > 0.9, balance, pump)
         return np.clip(torque / self.max_torque, -1, 1)[:, None]
+
+    def view(self) -> View:
+        return View(eye=(0.0, -3.0, 0.0), second_eye=(0.0, -3.0, 0.0))
+
+    def value_plane(self, points: int) -> ValuePlane:
+        """V over angle and speed."""
+        extent = (-np.pi, np.pi, -8.0, 8.0)
+        angle, speed = np.meshgrid(np.linspace(*extent[:2], points), np.linspace(*extent[2:], points), indexing="ij")
+        observation = np.stack([np.cos(angle).ravel(), np.sin(angle).ravel(), speed.ravel()], 1)
+        axes = (("angle", "rad"), ("speed", "rad/s"))
+        return ValuePlane(observation, (points, points), extent, axes, {"upright": (0.0, 0.0)})

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from envs import fr3, kinematics
-from envs.task import AbstractTask, Array, Start, whole_steps
+from envs.task import AbstractTask, Arm, Array, Start, ValuePlane, View, whole_steps
 
 ORIGIN = np.array([0.20, 0.0, -0.15])  # [m] origin of the task frame on the table, base frame, unless told otherwise
 PUCK_RADIUS, PUCK_HALF_HEIGHT = 0.025, 0.015  # [m]
@@ -41,7 +41,7 @@ class Push(AbstractTask):
     name = "push"
     observation_names = ("tip_x", "tip_y", "puck_x", "puck_y")
     arm_joints = (0, 1, 3)  # commanded with control="joint"
-    rest, tool_length = REST, TOOL_LENGTH
+    arm = Arm(rest=REST, tool_length=TOOL_LENGTH)
 
     def __init__(
         self,
@@ -126,10 +126,6 @@ class Push(AbstractTask):
         )
         return spec
 
-    def held(self, qpos: Array) -> Array:
-        """The command [N, C] that leaves the arm where it is, for joint positions [N, nq]."""
-        return self.observe(qpos, qpos)[:, :2] if self.control == "cartesian" else qpos[:, :7].copy()
-
     def home(self) -> Array:
         """Joint angles [1, 7] with the tip behind every puck start; computed once."""
         if self._home is None:
@@ -169,14 +165,14 @@ class Push(AbstractTask):
 
     def hold(self, qpos: Array) -> Array:
         if self.control == "joint":
-            return qpos.copy()
-        return kinematics.tip_position(qpos[:, :7], TOOL_LENGTH)[:, :2] - ORIGIN[:2]
+            return qpos[:, :7].copy()
+        return kinematics.tip_position(qpos[:, :7], TOOL_LENGTH)[:, :2] - self.origin[:2]
 
     def place(self, observation: Array, qpos: Array) -> Array:
         """The puck lies flat where it is seen; its turn about the vertical is not observed and left at zero."""
         placed = qpos.copy()
-        placed[:, 7:14] = [0, 0, ORIGIN[2] + PUCK_HALF_HEIGHT, 1, 0, 0, 0]
-        placed[:, 7:9] = observation[:, 2:4] + ORIGIN[:2]
+        placed[:, 7:14] = [0, 0, self.origin[2] + PUCK_HALF_HEIGHT, 1, 0, 0, 0]
+        placed[:, 7:9] = observation[:, 2:4] + self.origin[:2]
         return placed
 
     def observe(self, qpos: Array, qvel: Array) -> Array:
@@ -216,7 +212,28 @@ class Push(AbstractTask):
             return np.concatenate([xy, np.full_like(xy[..., :1], height)], -1) + self.origin
 
         xy = observation[..., :4]
-        return {"tip": lift(xy[..., :2], TOOL_HEIGHT), "object": lift(xy[..., 2:4], PUCK_HALF_HEIGHT)}
+        return {"tool": lift(xy[..., :2], TOOL_HEIGHT), "object": lift(xy[..., 2:4], PUCK_HALF_HEIGHT)}
+
+    def place_of(self, qpos: Array) -> Array:
+        return qpos[:, 7:10]
+
+    def view(self) -> View:
+        return View(
+            eye=(1.18, -0.76, 0.46),
+            target=(0.385, 0.02, 0.025),
+            second_eye=(0.43, 0.0, 0.42),
+            second_target=(0.43, 0.0, -0.15),
+            object_radius=PUCK_RADIUS,
+            object_height=2 * PUCK_HALF_HEIGHT,
+        )
+
+    def value_plane(self, points: int) -> ValuePlane:
+        """V over the tip's place on the table with the puck in the middle of its range (the paper's Figure 7)."""
+        (x0, y0), (x1, y1), puck = WORKSPACE_LOW.tolist(), WORKSPACE_HIGH.tolist(), (0.2, 0.0)
+        x, y = np.meshgrid(np.linspace(x0, x1, points), np.linspace(y0, y1, points), indexing="ij")
+        observation = np.stack([x.ravel(), y.ravel(), np.full(x.size, puck[0]), np.full(x.size, puck[1])], 1)
+        axes = (("x", "m"), ("y", "m"))
+        return ValuePlane(observation, (points, points), (x0, x1, y0, y1), axes, {"puck": puck})
 
     def _tip_target(self, xy: Array) -> Array:
         return np.concatenate([xy, np.full((len(xy), 1), TOOL_HEIGHT)], 1) + self.origin

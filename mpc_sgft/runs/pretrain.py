@@ -139,7 +139,7 @@ def explorer(agent: Agent, cfg: DictConfig, round_number: int) -> Act:
     """The policy with its own noise; a share of the environments also makes detours, so that the model sees mistakes.
 
     A detour holds one action for some steps: none at all, or one drawn uniformly. Without, the critic never learns what
-    it is worth to rest where the puck should lie, because the policy, whose actions are noisy, never rests.
+    it is worth to rest at the goal, because the policy, whose actions are noisy, never rests.
     """
     seed, detour = _seed(cfg.seed, round_number), cfg.detours
     generator = torch.Generator().manual_seed(seed)

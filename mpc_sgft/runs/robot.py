@@ -52,7 +52,7 @@ def make_env(cfg: DictConfig, place: Place | None = None) -> ControlEnv:
         raise UserError("--backend franka needs --robot-ip IP, or --robot-ip stand-in to rehearse without a robot.")
     if cfg.perception.name == "stand_in" and ip != STAND_IN:
         raise UserError(
-            "perception=stand_in sees the stand-in's table alone. Choose how the object is seen: perception=..."
+            "perception=stand_in sees the stand-in's scene alone. Choose how the object is seen: perception=..."
         )
     if ip != STAND_IN and clock == "robot":
         raise UserError("backend.clock=robot is for the stand-in. A robot needs real time: leave backend.clock= out.")
@@ -60,6 +60,8 @@ def make_env(cfg: DictConfig, place: Place | None = None) -> ControlEnv:
         raise UserError(f"the stand-in has no camera for perception={cfg.perception.name}. Leave perception= out.")
     with from_config("task"):
         task = instantiate({**cfg.task.env, **on_robot}, _convert_="all")
+    if task.arm is None:
+        raise UserError(f"task={cfg.chosen.task} cannot run on the robot: its class gives it no arm.")
     with from_config("backend.limits"):
         limits = Limits(**settings["limits"])
     with from_config("backend.gripper"):
@@ -80,7 +82,7 @@ def make_env(cfg: DictConfig, place: Place | None = None) -> ControlEnv:
             return instantiate(made, _convert_="all"), place if cfg.perception.name != "fixed" else None
 
     with from_config("backend"):
-        gate = Gate(limits, tool_length=task.tool_length, sample_dt=SAMPLE_DT)
+        gate = Gate(limits, tool_length=task.arm.tool_length, sample_dt=SAMPLE_DT)
         clock = clock or ("robot" if ip == STAND_IN else "wall")
         patience, dry_run = settings["patience"], settings["dry_run"]
         rig = Rig(arm, look, gate, gripper=gripper, clock=clock, patience=patience, dry_run=dry_run)

@@ -20,7 +20,7 @@ MEANS = {
     "takeover": "take over / hand back",
     "confirm": "confirm",
 }
-ROWS = ("robot", "tip", "gripper", "object", "rollout", "successes", "now", "note", "key")
+ROWS = ("robot", "tool", "gripper", "object", "rollout", "successes", "now", "note", "key")
 
 
 class Page:

@@ -18,18 +18,12 @@ GRID = 41  # points of the value map along each axis
 
 
 def layout(env: ControlEnv) -> Layout:
-    """Where the viewer's cameras stand for a task."""
-    if "object" in env.task.points(np.zeros((1, env.raw_dim))):
-        return Layout(
-            eye=(1.18, -0.76, 0.46),
-            target=(0.385, 0.02, 0.025),
-            second_eye=(0.43, 0.0, 0.42),
-            second_target=(0.43, 0.0, -0.15),
-            object_radius=0.025,
-            object_height=0.03,
-            metrics=("success",),
-        )
-    return Layout(eye=(0.0, -3.0, 0.0), second_eye=(0.0, -3.0, 0.0), value_maps=(), metrics=("success",))
+    """How the viewer shows a task, as the task says."""
+    plane = env.task.value_plane(2)
+    if plane is None:
+        return Layout(**env.task.view()._asdict(), value_maps=(), metrics=("success",))
+    label = f"V({', '.join(name for name, _ in plane.axes)})"
+    return Layout(**env.task.view()._asdict(), value_label=label, metrics=("success",))
 
 
 class DeployViewer:
@@ -56,7 +50,7 @@ class DeployViewer:
         reward = steps["next", "reward"][:, 0].numpy()
         view = EpisodeView(
             title=title,
-            ee=real.get("tip", np.zeros((len(observation), 3))),
+            ee=real.get("tool", np.zeros((len(observation), 3))),
             object=real.get("object"),
             qpos=rollout.qpos,
             reward=reward,
@@ -73,26 +67,23 @@ class DeployViewer:
             paths = []
             for t, plans, values in rollout.candidates:
                 many = self._imagined(model, steps["observation"][t].expand(len(plans), -1), plans)
-                paths.append(Candidates(t, many["tip"], values.numpy()))
-            view = view._replace(imagined_ee=imagined["tip"], imagined_object=imagined.get("object"), candidates=paths)
+                paths.append(Candidates(t, many["tool"], values.numpy()))
+            view = view._replace(imagined_ee=imagined["tool"], imagined_object=imagined.get("object"), candidates=paths)
         self.viewer.episode(view)
 
     def value_map(self, name: str, model: WorldModel) -> None:
-        """V over the tip's place on the table with the puck in the middle of its range (the paper's Figure 7)."""
-        names = self.task.points(np.zeros((1, self.env.raw_dim)))
-        if "object" not in names:
+        """V over the plane that the task names, in a state at rest with no commands behind it."""
+        plane = self.task.value_plane(GRID)
+        if plane is None:
             return
-        extent = (-0.08, 0.56, -0.32, 0.32)
-        puck = (0.2, 0.0)
-        x, y = np.meshgrid(np.linspace(*extent[:2], GRID), np.linspace(*extent[2:], GRID), indexing="ij")
-        raw = np.stack([x.ravel(), y.ravel(), np.full(x.size, puck[0]), np.full(x.size, puck[1])], 1)
-        still = np.concatenate([np.tile(raw, (1, self.env.history + 1)), np.zeros((x.size, self.env.obs_dim))], 1)
-        observation = torch.from_numpy(still[:, : self.env.obs_dim]).float()
+        still = np.tile(plane.observation, (1, self.env.history + 1))
+        past = np.zeros((len(still), self.env.obs_dim - still.shape[1]))
+        observation = torch.from_numpy(np.concatenate([still, past], 1)).float()
         with torch.inference_mode():
             values = model.terminal_value(model.encode(observation.to(next(model.parameters()).device)))
-        grid = values.cpu().numpy().reshape(GRID, GRID)
+        grid = values.cpu().numpy().reshape(plane.shape)
         self.limits = self.limits or (float(grid.min()), float(grid.max()))
-        self.viewer.value_map(name, grid, extent, marks={"puck": puck}, limits=self.limits)
+        self.viewer.value_map(name, grid, plane.extent, marks=plane.marks, limits=self.limits, axes=plane.axes)
 
     def success(self, share: float) -> None:
         """Add the success of an evaluation."""

@@ -31,8 +31,9 @@ def log_value_map(
     extent: tuple[float, float, float, float],
     marks: Mapping[str, tuple[float, float]],
     limits: tuple[float, float] | None,
+    axes: tuple[tuple[str, str], tuple[str, str]] = (("x", "m"), ("y", "m")),
 ) -> None:
-    """Log the picture statically at `path`; x points right, y points up. Arguments as RunViewer.value_map's.
+    """Log the picture statically at `path`; the first axis right, the second up. Arguments as RunViewer.value_map's.
 
     Raises:
         ValueError: If values is not a finite matrix, or the extent or the limits are not increasing.
@@ -45,8 +46,11 @@ def log_value_map(
     if not (x0 < x1 and y0 < y1 and low <= high):
         raise ValueError(f"Need x0 < x1, y0 < y1 and low <= high, got extent {extent} and limits {(low, high)}.")
     left, top, room_x, room_y = MAP
-    scale = min(room_x / (x1 - x0), room_y / (y1 - y0))
-    width, height = round((x1 - x0) * scale), round((y1 - y0) * scale)
+    (x_name, x_unit), (y_name, y_unit) = axes
+    scale_x, scale_y = room_x / (x1 - x0), room_y / (y1 - y0)
+    if x_unit == y_unit:
+        scale_x = scale_y = min(scale_x, scale_y)
+    width, height = round((x1 - x0) * scale_x), round((y1 - y0) * scale_y)
     left += (room_x - width) // 2
     share = (_smooth(values, width, height) - low) / max(high - low, 1e-12)
     picture = np.full((CANVAS[1], CANVAS[0], 3), BACKGROUND, dtype=np.uint8)
@@ -55,14 +59,14 @@ def log_value_map(
     recording.log(path, rr.Image(picture), static=True)
     below, right = top + height + 20, sum(BAR) + 34
     texts = {
-        (left + 24, below): f"x {x0:.2f} m", (left + width - 24, below): f"{x1:.2f} m",
-        (left - 44, top + height - 14): f"{y0:.2f} m", (left - 44, top + 14): f"y {y1:.2f} m",
+        (left + 24, below): f"{x_name} {x0:.2f} {x_unit}", (left + width - 24, below): f"{x1:.2f} {x_unit}",
+        (left - 44, top + height - 14): f"{y0:.2f} {y_unit}", (left - 44, top + 14): f"{y_name} {y1:.2f} {y_unit}",
         (right, top + 14): f"{high:.3g}", (right, top + height - 14): f"{low:.3g}",
     }  # fmt: skip
     recording.log(
         f"{path}/axes", rr.Points2D(list(texts), radii=0.01, colors=TEXT, labels=list(texts.values())), static=True
     )
-    places = [(left + (x - x0) * scale, top + (y1 - y) * scale) for x, y in marks.values()]
+    places = [(left + (x - x0) * scale_x, top + (y1 - y) * scale_y) for x, y in marks.values()]
     recording.log(f"{path}/marks", rr.Points2D(places, colors=MARK, radii=4.0, labels=list(marks)), static=True)
 
 

@@ -127,22 +127,24 @@ class RunViewer:
         *,
         marks: Mapping[str, tuple[float, float]] | None = None,
         limits: tuple[float, float] | None = None,
+        axes: tuple[tuple[str, str], tuple[str, str]] = (("x", "m"), ("y", "m")),
     ) -> None:
-        """Show a value over the end effector's x and y; a later map of the same name replaces it.
+        """Show a value over two quantities; a later map of the same name replaces it.
 
         Args:
             name: One of Layout.value_maps.
             values: [G, G'], first index along x, second along y.
-            extent: x from, x to, y from, y to, [m].
-            marks: Named places to mark, such as where the object is, [m].
+            extent: x from, x to, y from, y to, in the units of the axes.
+            marks: Named places to mark, such as where the object is.
             limits: Values of the first and last colour, to compare maps; None: from this map.
+            axes: Name and unit of x and y; of one unit, both have one scale.
 
         Raises:
             ValueError: If the blueprint has no view of that name, or values is not a finite matrix.
         """
         if name not in self._layout.value_maps:
             raise ValueError(f"No view for the value map {name!r}. The layout has {list(self._layout.value_maps)}.")
-        log_value_map(self._recording, f"value_map/{name}", values, extent, marks or {}, limits)
+        log_value_map(self._recording, f"value_map/{name}", values, extent, marks or {}, limits, axes)
         self._flush()
 
     def close(self) -> None:

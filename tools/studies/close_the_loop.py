@@ -8,12 +8,11 @@ is known to the two deployments alone.
 """
 
 import argparse
-import csv
 import json
 from pathlib import Path
 
-from mpc_sgft import deploy
 from mpc_sgft.diagnose.__main__ import main as diagnose
+from tools.studies.runner import finished, write
 
 COLUMNS = [
     "gap",
@@ -44,14 +43,12 @@ def main() -> None:
     for gap in args.gaps:
         for seed in args.seeds:
             rows.append(one(gap, seed, args.runs / f"{gap}-{seed}", args.transitions, args.set))
-            write(args.csv, rows)
+            write(args.csv, COLUMNS, rows)
 
 
 def one(gap: str, seed: int, run: Path, transitions: int, overrides: list[str]) -> dict[str, object]:
-    """One row; raises SystemExit with the command's exit code if one fails."""
-    if not (run / "summary.json").exists():
-        start = ["--resume", str(run)] if run.exists() else [f"gap={gap}", f"seed={seed}", f"run_dir={run}"]
-        check(deploy.main([*start, *([] if run.exists() else ["log.rerun=false", *overrides])]))
+    """One row; raises RunFailed or SystemExit if a command fails."""
+    finished("deploy", run, [f"gap={gap}", f"seed={seed}", "log.rerun=false", *overrides])
     found = run / "diagnosis"
     if not (found / "retrain.json").exists():
         check(diagnose(["--run", str(run), "--retrain", "--retrain-transitions", str(transitions)]))
@@ -82,14 +79,6 @@ def words(effect: dict) -> str:
 def check(code: int) -> None:
     if code:
         raise SystemExit(code)
-
-
-def write(path: Path, rows: list[dict[str, object]]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
 
 
 if __name__ == "__main__":

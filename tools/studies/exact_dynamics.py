@@ -9,9 +9,9 @@ steps, an episode about a minute of one core.
 """
 
 import argparse
-import csv
+import itertools
 from collections.abc import Callable, Iterator
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +26,7 @@ from mpc_sgft.learning.world_model import WorldModel
 from mpc_sgft.runs import build
 from mpc_sgft.runs.collect import collect, planner_policy, score
 from mpc_sgft.runs.pretrain import EVAL_SEED
+from tools.studies.runner import measured
 
 COLUMNS = ["gap", "horizon", "reward", "episodes", "success", "success_low", "success_high", "episode_return"]
 
@@ -102,17 +103,25 @@ def _fields(env: ControlEnv) -> list[Array]:
     return [*b.state, b.act, b.signal, b.delayed, b.clock, b.batch.bind("qacc_warmstart"), b.target, b.told]
 
 
-def measure(gap: str, horizon: int, true_reward: bool, episodes: int) -> dict[str, object]:
+def measure(gap: str, horizon: int, reward: str, episodes: int) -> dict[str, object]:
     """Success over the first evaluation episodes of a gap, a row of the CSV."""
     cfg = compose("deploy", [f"gap={gap}", f"planner.horizon={horizon}", "planner.chunk_rows=832"], [])
     build.prepare_process(cfg)
     agent, _ = build.load_agent(cfg)
     env = build.make_env(cfg, episodes)
-    model = ExactModel(agent.model, env, lambda n: build.make_env(cfg, n), true_reward=true_reward)
+    model = ExactModel(agent.model, env, lambda n: build.make_env(cfg, n), true_reward=reward == "true")
     act = planner_policy(model, build.make_planner(cfg, env.action_dim), EVAL_SEED)  # type: ignore[arg-type]
     result = score(collect(env, lambda o, fresh: act(o, fresh).float(), seed=EVAL_SEED))
-    kind = "true" if true_reward else "learned"
-    row = [gap, horizon, kind, episodes, result.success, result.success_low, result.success_high, result.episode_return]
+    row = [
+        gap,
+        horizon,
+        reward,
+        episodes,
+        result.success,
+        result.success_low,
+        result.success_high,
+        result.episode_return,
+    ]
     return dict(zip(COLUMNS, row, strict=True))
 
 
@@ -124,16 +133,11 @@ def main() -> None:
     parser.add_argument("--reward", nargs="+", choices=("learned", "true"), default=["learned"])
     parser.add_argument("--episodes", type=int, default=24)
     args = parser.parse_args()
-    with args.csv.open("w", newline="") as file:
-        table = csv.DictWriter(file, COLUMNS)
-        table.writeheader()
-        for gap in args.gaps:
-            for horizon in args.horizons:
-                for reward in args.reward:
-                    row = measure(gap, horizon, reward == "true", args.episodes)
-                    table.writerow(row)
-                    file.flush()
-                    print(row, flush=True)
+    keys = [
+        {"gap": gap, "horizon": horizon, "reward": reward}
+        for gap, horizon, reward in itertools.product(args.gaps, args.horizons, args.reward)
+    ]
+    measured(args.csv, COLUMNS, keys, partial(measure, episodes=args.episodes))
 
 
 if __name__ == "__main__":

@@ -8,14 +8,11 @@ run whose summary is there is not repeated. With several --checkpoints, seed s u
 """
 
 import argparse
-import csv
 import itertools
-import json
-import os
-import subprocess
 import sys
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+
+from tools.studies.runner import each, finished, write
 
 COLUMNS = ["gap", "method", "variant", "seed", "rollouts", "success", "episodes", "frozen_sha256"]
 
@@ -36,42 +33,35 @@ def main() -> None:
     args = parser.parse_args()
     jobs = list(itertools.product(args.seeds, args.gaps, args.methods, args.variants))
 
-    def work(job: tuple[int, str, str, str]) -> dict | None:
+    def work(job: tuple[int, str, str, str]) -> dict:
         seed, gap, method, variant = job
         checkpoint = args.checkpoints[seed % len(args.checkpoints)]
         label = "-".join(
             str(x).translate(str.maketrans("/=", "__")) for x in (args.csv.stem, gap, method, variant, seed) if x != ""
         )
-        folder = args.runs / label
-        words = [f"gap={gap}", f"method={method}", f"seed={seed}", f"run_dir={folder}", "log.rerun=false", "quiet=true"]
+        words = [f"gap={gap}", f"method={method}", f"seed={seed}", "log.rerun=false"]
         words += [variant] if variant else []
         words += [f"checkpoint={checkpoint}"] if checkpoint else []
-        summary = folder / "summary.json"
-        if not summary.exists():
-            command = [sys.executable, "-m", "mpc_sgft.deploy", *words, *args.set]
-            if folder.exists():
-                command = [sys.executable, "-m", "mpc_sgft.deploy", "--resume", str(folder)]
-            done = subprocess.run(command, capture_output=True, text=True, env=os.environ | {"OMP_NUM_THREADS": "1"})
-            if done.returncode:
-                print(f"{label}: failed ({done.returncode})\n{done.stderr[-2000:]}", flush=True)
-                return None
-        result = json.loads(summary.read_text())
+        result = finished("deploy", args.runs / label, [*words, *args.set])
         curve = ", ".join(f"{k}: {v:.0%}" for k, v in result["curve"].items())
         print(f"{label}: {curve} ({result['wall_seconds']:.0f} s)", flush=True)
         return result | {"variant": variant}
 
-    with ThreadPoolExecutor(args.jobs) as pool:
-        results = [r for r in pool.map(work, jobs) if r is not None]
+    results, failed = each(jobs, work, args.jobs)
     rows = [
-        [r["gap"], r["method"], r["variant"], r["seed"], k, s, r["evaluation_episodes"], r["frozen_sha256"][:12]]
+        {
+            **r,
+            "rollouts": k,
+            "success": s,
+            "episodes": r["evaluation_episodes"],
+            "frozen_sha256": r["frozen_sha256"][:12],
+        }
         for r in results
         for k, s in r["curve"].items()
     ]
-    args.csv.parent.mkdir(parents=True, exist_ok=True)
-    with args.csv.open("w", newline="") as file:
-        csv.writer(file).writerows([COLUMNS, *rows])
-    if len(results) < len(jobs):
-        sys.exit(f"{len(jobs) - len(results)} of {len(jobs)} runs failed")
+    write(args.csv, COLUMNS, rows)
+    if failed:
+        sys.exit(f"{failed} of {len(jobs)} runs failed")
 
 
 if __name__ == "__main__":

@@ -46,7 +46,7 @@ def on_stand_in(robot_push: Push, robot_config: dict) -> Iterator[Callable[..., 
 
     def make(stand_in: StandIn, width: float | None = None, **changes: float) -> FrankaBackend:
         limits = Limits(**{**robot_config["limits"], **SLOW, **changes})
-        gate = Gate(limits, tool_length=robot_push.tool_length, sample_dt=SAMPLE_DT)
+        gate = Gate(limits, tool_length=robot_push.arm.tool_length, sample_dt=SAMPLE_DT)
         arm = Arm(stand_in.ip, **{**robot_config["arm"], "timeout": 30})
         look = lambda: (stand_in, stand_in.scene.place)  # noqa: E731
         gripper = Gripper(**{**robot_config["gripper"], "width": width})

@@ -101,7 +101,7 @@ def test_the_last_mark_counts():
 def test_the_page_shows_everything(person):
     from rich.console import Console
 
-    person.watch(lambda: {"robot": "Move", "tip": "x 0.1", "object": "seen 0.1 s ago"})
+    person.watch(lambda: {"robot": "Move", "tool": "x 0.1", "object": "seen 0.1 s ago"})
     person.enter("running", 2)
     person.tell(step="3 of 40", note="limited: workspace box", successes="1 of 1")
     person.tell(note="")

@@ -1,0 +1,54 @@
+"""Many runs, one row each: what is done is skipped, what was cut off goes on."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from tools.studies.runner import RunFailed, each, finished, measured
+
+TINY = ["+experiment=debug", "task=pendulum", "transitions=640", "log.tensorboard=false"]
+
+
+def test_a_run_is_made_once_and_resumed_if_cut_off(tmp_path):
+    run = tmp_path / "run"
+    summary = finished("pretrain", run, TINY)
+    assert summary["transitions"] == 640
+    stamp = (run / "checkpoint" / "state.pt").stat().st_mtime_ns
+    (run / "summary.json").write_text(json.dumps({"known": True}))
+    assert finished("pretrain", run, TINY) == {"known": True}  # it is there: nothing runs
+    (run / "summary.json").unlink()
+    assert finished("pretrain", run, ["seed=99"])["seed"] == 0  # resumed: the run's own settings
+    assert (run / "checkpoint" / "state.pt").stat().st_mtime_ns > stamp
+
+
+def test_a_failure_is_told_and_the_others_go_on(tmp_path, capsys):
+    def work(name):
+        if name == "bad":
+            finished("pretrain", tmp_path / name, ["tsak=push"])
+        return {"name": name}
+
+    assert each(["a", "bad", "b"], work, 2) == ([{"name": "a"}, {"name": "b"}], 1)
+    assert "tsak" in capsys.readouterr().err
+    with pytest.raises(RunFailed, match="exit code 2"):
+        work("bad")
+
+
+def test_rows_are_on_disk_as_they_come_and_not_measured_twice(tmp_path):
+    path, asked = tmp_path / "new" / "out.csv", []
+
+    def work(gap, horizon):
+        asked.append((gap, horizon))
+        if gap == "c" and len(asked) == 2:
+            raise KeyboardInterrupt
+        return {"gap": gap, "horizon": horizon, "success": 0.5}
+
+    keys = [{"gap": "a", "horizon": 4}, {"gap": "c", "horizon": 4}]
+    with pytest.raises(KeyboardInterrupt):
+        measured(path, ["gap", "horizon", "success"], keys, work)
+    assert path.read_text() == "gap,horizon,success\na,4,0.5\n"
+    measured(path, ["gap", "horizon", "success"], keys, work)
+    assert asked == [("a", 4), ("c", 4), ("c", 4)] and len(path.read_text().splitlines()) == 3
+    with pytest.raises(ValueError, match="other"):
+        measured(path, ["gap", "other"], keys, work)
+    assert Path(path).read_text().startswith("gap,horizon,success")

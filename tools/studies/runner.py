@@ -1,0 +1,90 @@
+"""What the studies share: many runs, each in a process of its own, and a CSV that goes on where it stopped.
+
+Not run by itself. A run whose summary is there is not made again, one that was cut off is resumed; a row whose key is
+in the CSV is not measured again.
+"""
+
+import csv
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any, TypeVar
+
+Job = TypeVar("Job")
+
+
+class RunFailed(Exception):
+    """A run of a study ended with an error; the message holds the end of what it said."""
+
+
+def finished(command: str, folder: Path, overrides: Sequence[str]) -> dict[str, Any]:
+    """The summary of `python -m mpc_sgft.COMMAND` in a run folder: read if it is there, else run or resumed.
+
+    Raises:
+        RunFailed: If the command does.
+    """
+    summary = folder / "summary.json"
+    if not summary.exists():
+        words = [f"run_dir={folder}", "quiet=true", *overrides]
+        words = ["--resume", str(folder)] if (folder / "config.yaml").exists() else words
+        line = [sys.executable, "-m", f"mpc_sgft.{command}", *words]
+        done = subprocess.run(line, capture_output=True, text=True, env=os.environ | {"OMP_NUM_THREADS": "1"})
+        if done.returncode:
+            raise RunFailed(f"{folder}: exit code {done.returncode}\n{done.stderr[-2000:]}")
+    return json.loads(summary.read_text())
+
+
+def each(jobs: Sequence[Job], work: Callable[[Job], dict[str, Any]], side_by_side: int) -> tuple[list[dict], int]:
+    """What `work` makes of each job, in their order, and how many failed; what failed is printed."""
+
+    def tried(job: Job) -> dict[str, Any] | None:
+        try:
+            return work(job)
+        except RunFailed as error:
+            print(error, file=sys.stderr, flush=True)
+            return None
+
+    with ThreadPoolExecutor(side_by_side) as pool:
+        found = list(pool.map(tried, jobs))
+    results = [result for result in found if result is not None]
+    return results, len(found) - len(results)
+
+
+def write(path: Path, columns: Sequence[str], rows: Iterable[dict[str, Any]]) -> None:
+    """A whole CSV, its folder made if need be."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("w", newline="") as file:
+        table = csv.DictWriter(file, columns, extrasaction="ignore", lineterminator="\n")
+        table.writeheader()
+        table.writerows(rows)
+
+
+def measured(path: Path, columns: Sequence[str], keys: Sequence[dict[str, Any]], work: Callable[..., dict]) -> None:
+    """Rows of a CSV, one a key, each on disk as soon as it is measured; a key that has a row is left alone.
+
+    Args:
+        path: The CSV.
+        columns: Its columns, those of the keys among them.
+        keys: What to measure; `work(**key)` gives the row.
+        work: Measures one.
+
+    Raises:
+        ValueError: If the file there has other columns.
+    """
+    rows: list[dict[str, Any]] = []
+    if path.exists():
+        with path.open(newline="") as file:
+            table = csv.DictReader(file)
+            rows = list(table)
+            if list(table.fieldnames or []) != list(columns):
+                raise ValueError(f"{path} has the columns {table.fieldnames}, not {list(columns)}: give another file")
+    for key in keys:
+        if any(all(str(row[name]) == str(value) for name, value in key.items()) for row in rows):
+            continue
+        rows.append(work(**key))
+        write(path, columns, rows)
+        print(rows[-1], flush=True)
