@@ -102,8 +102,8 @@ def run(
             if unmoved and not settled(best) and was - best.error > judge.least_gain(was):
                 setup, hypotheses = search(setup, terms, max_effects, rng, show)
                 best = choose_set(setup, hypotheses, rng)
-        residual = None if settled(best) else fit_residual_model(setup, best, sizes, rng)
-        verdict = reach_verdict(setup, hypotheses, residual, rng)
+        residual_model = None if settled(best) else fit_residual_model(setup, best, sizes, rng)
+        verdict = reach_verdict(setup, hypotheses, residual_model, rng)
         bar.update(100 - bar.n)
     notes = [n for e in recorded for n in e.notes]
     if len(recorded) == 1:
@@ -112,7 +112,7 @@ def run(
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
         notes += repair.write(plant, verdict.best, out)
-    report = assemble(plant, setup, hypotheses, verdict, notes, rng, residual and residual.error)
+    report = assemble(plant, setup, hypotheses, verdict, notes, rng, residual_model and residual_model.error)
     report.data["seconds"] = round(time.perf_counter() - began, 2)
     if out is not None:
         report.write(out)
@@ -139,7 +139,7 @@ def assemble(
     verdict: Verdict,
     notes: list[str],
     rng: np.random.Generator,
-    residual: float | None,
+    residual_model_error: float | None,
 ) -> Report:
     """Everything that the report says; errors are those of the scene in its own steps."""
     best, base, sharp = verdict.best, setup.baseline, setup.problem.replayer
@@ -168,7 +168,7 @@ def assemble(
             name: {"noise": float(setup.noise[i]), "simulator": float(setup.floor[i])}
             for i, name in enumerate(replayer.signals)
         },
-        "residual_model_error": residual,
+        "residual_model_error": residual_model_error,
         "seconds": 0.0,
         "repaired_model": "repaired.xml",
         "effects_file": "effects.yaml",

@@ -30,10 +30,12 @@ class Parameter(NamedTuple):
     starts: tuple[float | Callable[[TypicalSizes], float], ...] = (0.1,)
     low: float = -100.0
     high: float = 100.0
-    hop: Callable[[TypicalSizes], float] = lambda s: 0.0  # between values that fit about as well: fits try neighbours
+    hop: Callable[[TypicalSizes], float] = lambda s: 0.0  # between values that fit about as well; fits try them too
 
 
 class EffectFacts(NamedTuple):
+    """What diagnose must know of an effect beside its physics."""
+
     parameters: Mapping[str, Parameter]
     driven: bool = False  # only where a motor sits
     sums: Mapping[str, tuple[str, str]] = {}  # the effect's parameter -> fitted ones that it is the sum of

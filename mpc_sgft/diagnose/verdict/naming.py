@@ -109,14 +109,14 @@ def prune(setup: Setup[Any], best: Hypothesis, hypotheses: list[Hypothesis], rng
 
 
 def reach_verdict(
-    setup: Setup[Any], hypotheses: list[Hypothesis], residual: ResidualModel | None, rng: np.random.Generator
+    setup: Setup[Any], hypotheses: list[Hypothesis], residual_model: ResidualModel | None, rng: np.random.Generator
 ) -> Verdict:
     """Compare everything that was fitted.
 
     Args:
         setup: Problem and baseline.
         hypotheses: From `search`, baseline first.
-        residual: Residual model on top of the chosen set; None if it was not fitted.
+        residual_model: Residual model on top of the chosen set; None if it was not fitted.
         rng: For the bootstrap.
     """
     best = choose(setup, hypotheses, rng)
@@ -129,8 +129,8 @@ def reach_verdict(
     best, ties = as_given(setup, best, find_ties(setup, best, hypotheses, rng))
     declared = [(e, equivalence(best, e)) for e in ties]
     base = hypotheses[0]
-    if residual is not None and beats(residual, best, base, setup.parts, rng):
-        missed = (best.error - residual.error) / max(base.error - residual.error, 1e-12)
+    if residual_model is not None and beats(residual_model, best, base, setup.parts, rng):
+        missed = (best.error - residual_model.error) / max(base.error - residual_model.error, 1e-12)
         reason = f"a flexible residual model explains {missed:.0%} more of the error than {_list(best)}"
         ties = [(e, "" if q is None else q.reason) for e, q in declared]
         return Verdict("unknown", best, ties, probability, reason)
@@ -138,7 +138,7 @@ def reach_verdict(
     if not best.effects:
         reason = "the nominal model's error is within noise and the simulator's floor"
         if not settled(base):
-            tried = "no name" if residual is None else "no name and no flexible model"
+            tried = "no name" if residual_model is None else "no name and no flexible model"
             reason = f"{tried} explains the error, {times:.1f} times noise and floor, on windows that were not fitted"
         return Verdict("none", best, [], probability, reason)
     if judge.leaves_much(best.error, base.error, LEFT):
@@ -260,11 +260,13 @@ def settled(best: Hypothesis) -> bool:
     return best.error < NOISE + ABOVE_NOISE
 
 
-def beats(residual: ResidualModel, best: Hypothesis, base: Hypothesis, parts: int, rng: np.random.Generator) -> bool:
+def beats(
+    residual_model: ResidualModel, best: Hypothesis, base: Hypothesis, parts: int, rng: np.random.Generator
+) -> bool:
     """Whether something that no name in the library covers is clearly there."""
-    if settled(best) or not judge.credible(best.errors, residual.errors, rng, parts):
+    if settled(best) or not judge.credible(best.errors, residual_model.errors, rng, parts):
         return False
-    return best.error - residual.error > UNEXPLAINED * (base.error - residual.error)
+    return best.error - residual_model.error > UNEXPLAINED * (base.error - residual_model.error)
 
 
 def standard_deviations(f_entry: Hypothesis) -> list[Array]:
