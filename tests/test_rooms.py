@@ -102,13 +102,13 @@ def test_the_rooms_of_mpc_sgft_point_one_way() -> None:
 
 
 def test_the_rooms_of_diagnose_point_one_way() -> None:
+    inside = {p.name for p in (ROOT / "mpc_sgft" / "diagnose").iterdir() if (p / "__init__.py").is_file()}
+    assert inside == set(DIAGNOSE)
     wrong = []
-    for name, others in graph(("mpc_sgft",)).items():
-        room = name.split(".")[2] if name.startswith("mpc_sgft.diagnose.") else ""
+    for name, others in graph(("mpc_sgft/diagnose",)).items():
+        room = name.split(".")[2] if name.count(".") > 1 else ""
         for other in others if room in DIAGNOSE else ():
-            if other.startswith("mpc_sgft.diagnose") and other.split(".")[2:3] not in [
-                [r] for r in DIAGNOSE[room] | {room}
-            ]:
+            if other.count(".") < 2 or other.split(".")[2] not in {room} | DIAGNOSE[room]:
                 wrong.append(f"{name} imports {other}")
     assert not wrong, wrong
 

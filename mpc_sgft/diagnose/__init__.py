@@ -4,7 +4,10 @@
     report = diagnose("scene.xml", ["episodes/"], out=Path("out"))
     report = diagnose_run(Path("runs/push/latest"))  # from mpc_sgft.diagnose.deployed: what deploy recorded
 
-`record -> replay -> locate -> fit -> name -> repair -> report`, one file each.
+`run` goes the whole way from files to a report, `deployed` from a deployment's run folder. Each room builds on those
+before it: `data` (read, check, smooth, cut), `simulation` (the nominal model over measured windows), `candidates` (what
+may be missing), `fitting` (how well a set of effects explains the data), `verdict` (its name, where it shows, the
+repair), `deployments` (a task's actions and observations in place of joint signals).
 """
 
 from __future__ import annotations

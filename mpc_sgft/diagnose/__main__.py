@@ -104,7 +104,7 @@ def _run_folder(args: argparse.Namespace) -> int:
         raise UserError(f"--retrain-transitions {args.retrain_transitions}: a whole number from 1 on.")
     out = args.out or args.run / "diagnosis"
     if args.retrain:
-        from mpc_sgft.diagnose.retrain import outcome, retrain, table
+        from mpc_sgft.diagnose.deployments.retrain import outcome, retrain, table
 
         outcome(args.run)  # an unfinished run stops here, not after the diagnosis
         taken = [str(out / part) for part in ("pretrain", "deploy") if (out / part).exists()]

@@ -14,25 +14,25 @@ import yaml
 
 from envs.effects.base import Effect
 from mpc_sgft.diagnose.candidates.suspects import gap_of, suspects
-from mpc_sgft.diagnose.check import check_settings
+from mpc_sgft.diagnose.data.check import check_settings
 from mpc_sgft.diagnose.data.measured import Array
 from mpc_sgft.diagnose.deployments.chain import Chain, Prediction, effects_of
-from mpc_sgft.diagnose.deployments.motion_link import SUB
+from mpc_sgft.diagnose.deployments.motion_link import JOINT_SAMPLES
 from mpc_sgft.diagnose.deployments.next_recording import next_experiment
 from mpc_sgft.diagnose.deployments.recordings import Deployment, read_deployment
 from mpc_sgft.diagnose.fitting.fit import fit
-from mpc_sgft.diagnose.fitting.hypothesis import Entry
-from mpc_sgft.diagnose.fitting.prepare import Setup, cut, split
-from mpc_sgft.diagnose.fitting.screen import Effort
+from mpc_sgft.diagnose.fitting.hypothesis import Hypothesis
+from mpc_sgft.diagnose.fitting.prepare import Setup, leave_out_blocks, split
+from mpc_sgft.diagnose.fitting.screening import Effort
 from mpc_sgft.diagnose.fitting.search import search
 from mpc_sgft.diagnose.report import Report
 from mpc_sgft.diagnose.run import candidate_rows, effect_rows, reduction
-from mpc_sgft.diagnose.verdict.naming import Verdict, caution, judge_entries
+from mpc_sgft.diagnose.verdict.naming import Verdict, caution, reach_verdict
 from mpc_sgft.storage.metrics import progress as bar_of
 
 LENGTH = 6  # control steps in a window
 MOST = 64  # windows
-EFFORT = Effort(beam=(2,), full=(5, 4, 3), screen=16, sharpen=16, enough=1.0, pairs=0, exchange=0)
+EFFORT = Effort(beam=(2,), full=(5, 4, 3), screen_windows=16, quick_windows=16, enough=1.0, pairs=0, exchange=0)
 
 
 def diagnose_run(
@@ -72,8 +72,8 @@ def diagnose_run(
             bar.set_postfix_str(what)
             bar.update(round(95 * share) - bar.n)
 
-        setup, entries = search(setup, terms, max_effects, rng, show, EFFORT)
-        verdict = judge_entries(setup, entries, None, rng)
+        setup, hypotheses = search(setup, terms, max_effects, rng, show, EFFORT)
+        verdict = reach_verdict(setup, hypotheses, None, rng)
         bar.update(100 - bar.n)
     notes = list(deployment.notes)
     if len(deployment.episodes) == 1:
@@ -82,7 +82,7 @@ def diagnose_run(
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
         notes += write(deployment, verdict.best, out)
-    report = assemble(setup, entries, verdict, notes, rng)
+    report = assemble(setup, hypotheses, verdict, notes, rng)
     report.data["seconds"] = round(time.perf_counter() - began, 2)
     if out is not None:
         report.write(out)
@@ -99,7 +99,7 @@ def prepare(deployment: Deployment, window: float | None, held_out: float | Sequ
     length = LENGTH if window is None else max(1, round(window / dt))
     chain = Chain(deployment, length, MOST)
     fitted, held = split(replayer_view(chain), held_out)
-    blocks = cut(len(fitted))
+    blocks = leave_out_blocks(len(fitted))
     floor = np.concatenate(
         [chain.observation_floor, np.full(chain.drive.shape[2], chain.drive_scale), chain.joint_floor]
     )
@@ -108,7 +108,7 @@ def prepare(deployment: Deployment, window: float | None, held_out: float | Sequ
 
 
 def assemble(
-    setup: Setup[Chain], entries: list[Entry], verdict: Verdict, notes: list[str], rng: np.random.Generator
+    setup: Setup[Chain], hypotheses: list[Hypothesis], verdict: Verdict, notes: list[str], rng: np.random.Generator
 ) -> Report:
     """Everything that the report says; keys as for `--model --data`."""
     chain, best = setup.problem, verdict.best
@@ -122,8 +122,8 @@ def assemble(
     data: dict[str, Any] = {
         "verdict": verdict.kind,
         "reason": verdict.reason,
-        "effects": effect_rows(best, entries, verdict) if shown else [],
-        "candidates": candidate_rows(entries, best, verdict, rng),
+        "effects": effect_rows(best, hypotheses, verdict) if shown else [],
+        "candidates": candidate_rows(hypotheses, best, verdict, rng),
         "ties": [
             {"effects": e.names, "probability": verdict.probability[e.key], "held_out_error": e.error, "reason": reason}
             for e, reason in verdict.ties
@@ -143,8 +143,10 @@ def assemble(
         "effects_file": "effects.yaml",
         "notes": notes,
     }
-    measured = np.concatenate([chain.observed, chain.drive[:, SUB - 1 :: SUB]], 2)
-    nominal, repaired = (np.concatenate([both.observation[k], both.drive[k][:, SUB - 1 :: SUB]], 2) for k in (0, 1))
+    measured = np.concatenate([chain.observed, chain.drive[:, JOINT_SAMPLES - 1 :: JOINT_SAMPLES]], 2)
+    nominal, repaired = (
+        np.concatenate([both.observation[k], both.drive[k][:, JOINT_SAMPLES - 1 :: JOINT_SAMPLES]], 2) for k in (0, 1)
+    )
     return Report(data, measured, nominal, repaired, replayer_view(chain))
 
 
@@ -189,7 +191,7 @@ def held_out_rows(
     ]
 
 
-def write(deployment: Deployment, best: Entry, out: Path) -> list[str]:
+def write(deployment: Deployment, best: Hypothesis, out: Path) -> list[str]:
     """Write effects.yaml and repaired.xml, the task's scene with the effects that MJCF carries; returns notes."""
     mapping, notes = gap_of(deployment.task, best.terms, best.values), []
     text = yaml.safe_dump({"effects": mapping}, sort_keys=False)

@@ -11,23 +11,23 @@ import mujoco
 import numpy as np
 
 from mpc_sgft.command.errors import UserError
-from mpc_sgft.diagnose.candidates.library import candidates, numbers, sums_of
+from mpc_sgft.diagnose.candidates.library import candidates, effect_parameters, sums_of
 from mpc_sgft.diagnose.candidates.nominal import nominal_terms, refit_table
-from mpc_sgft.diagnose.check import check_settings, episodes
+from mpc_sgft.diagnose.data.check import check_settings, episodes
 from mpc_sgft.diagnose.data.measured import Array, Episode, files, read_table
 from mpc_sgft.diagnose.fitting import judge
 from mpc_sgft.diagnose.fitting.fit import Fit, Problem, change_of
-from mpc_sgft.diagnose.fitting.flexible import flexible_fit
-from mpc_sgft.diagnose.fitting.hypothesis import Entry
-from mpc_sgft.diagnose.fitting.prepare import Setup, around, prepare, scales
-from mpc_sgft.diagnose.fitting.screen import key_of
-from mpc_sgft.diagnose.fitting.search import again, nearest, search
+from mpc_sgft.diagnose.fitting.hypothesis import Hypothesis
+from mpc_sgft.diagnose.fitting.prepare import Setup, near_fit, prepare, typical_sizes
+from mpc_sgft.diagnose.fitting.residual_model import fit_residual_model
+from mpc_sgft.diagnose.fitting.screening import key_of
+from mpc_sgft.diagnose.fitting.search import nearest, refit, search
 from mpc_sgft.diagnose.report import MAX_CANDIDATES, Report
 from mpc_sgft.diagnose.simulation.plant import SHARP, Change, Plant
 from mpc_sgft.diagnose.simulation.replay import Replayer
 from mpc_sgft.diagnose.verdict import repair
 from mpc_sgft.diagnose.verdict.locate import locate
-from mpc_sgft.diagnose.verdict.naming import Verdict, caution, effect_probability, intervals, judge_entries, settled
+from mpc_sgft.diagnose.verdict.naming import Verdict, caution, effect_probability, intervals, reach_verdict, settled
 from mpc_sgft.diagnose.verdict.naming import choose as choose_set
 from mpc_sgft.diagnose.verdict.next_experiment import next_experiment
 from mpc_sgft.storage.metrics import progress as bar_of
@@ -80,10 +80,10 @@ def run(
     )
 
     def nearer(f: Fit, hidden: float = UNSEEN) -> Setup[Problem]:
-        return _coarsest((around(setup, f, plant.sharper(step)) for step in steps), hidden)
+        return _coarsest((near_fit(setup, f, plant.sharper(step)) for step in steps), hidden)
 
     sharp = plant.sharper()
-    sizes = scales(sharp, setup.problem.replayer)
+    sizes = typical_sizes(sharp, setup.problem.replayer)
     with bar_of(100, desc="diagnose", unit="%", disable=not progress) as bar:
 
         def show(what: str, share: float) -> None:
@@ -92,18 +92,18 @@ def run(
 
         terms = candidates(sharp, sizes, effects)
         first = setup
-        setup, entries = search(first, terms, max_effects, rng, show, nearer=nearer)
-        best = choose_set(setup, entries, rng)
-        near = best if best.effects else nearest(entries)
+        setup, hypotheses = search(first, terms, max_effects, rng, show, nearer=nearer)
+        best = choose_set(setup, hypotheses, rng)
+        near = best if best.effects else nearest(hypotheses)
         if near.effects and not _sees(setup, near):  # windows began as another set sees it: look again as this one does
             was, unmoved, setup = near.error, setup is first, nearer(near.fit, NOTHING)
-            entries = again(setup, entries, near)
-            best = choose_set(setup, entries, rng)
-            if unmoved and not settled(best) and was - best.error > judge.worth(was):
-                setup, entries = search(setup, terms, max_effects, rng, show)
-                best = choose_set(setup, entries, rng)
-        flexible = None if settled(best) else flexible_fit(setup, best, sizes, rng)
-        verdict = judge_entries(setup, entries, flexible, rng)
+            hypotheses = refit(setup, hypotheses, near)
+            best = choose_set(setup, hypotheses, rng)
+            if unmoved and not settled(best) and was - best.error > judge.least_gain(was):
+                setup, hypotheses = search(setup, terms, max_effects, rng, show)
+                best = choose_set(setup, hypotheses, rng)
+        residual_model = None if settled(best) else fit_residual_model(setup, best, sizes, rng)
+        verdict = reach_verdict(setup, hypotheses, residual_model, rng)
         bar.update(100 - bar.n)
     notes = [n for e in recorded for n in e.notes]
     if len(recorded) == 1:
@@ -112,7 +112,7 @@ def run(
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
         notes += repair.write(plant, verdict.best, out)
-    report = assemble(plant, setup, entries, verdict, notes, rng, flexible and flexible.error)
+    report = assemble(plant, setup, hypotheses, verdict, notes, rng, residual_model and residual_model.error)
     report.data["seconds"] = round(time.perf_counter() - began, 2)
     if out is not None:
         report.write(out)
@@ -127,7 +127,7 @@ def _coarsest(setups: Iterable[Setup[Problem]], hidden: float) -> Setup[Problem]
     return setup
 
 
-def _sees(setup: Setup[Problem], e: Entry) -> bool:
+def _sees(setup: Setup[Problem], e: Hypothesis) -> bool:
     """Whether the problem is right near this set, in steps that are short enough."""
     return setup.near is not None and key_of(setup, setup.near.terms) == e.key and setup.stepping < NOTHING
 
@@ -135,11 +135,11 @@ def _sees(setup: Setup[Problem], e: Entry) -> bool:
 def assemble(
     plant: Plant,
     setup: Setup,
-    entries: list[Entry],
+    hypotheses: list[Hypothesis],
     verdict: Verdict,
     notes: list[str],
     rng: np.random.Generator,
-    flexible: float | None,
+    residual_model_error: float | None,
 ) -> Report:
     """Everything that the report says; errors are those of the scene in its own steps."""
     best, base, sharp = verdict.best, setup.baseline, setup.problem.replayer
@@ -156,8 +156,8 @@ def assemble(
     data: dict[str, Any] = {
         "verdict": verdict.kind,
         "reason": verdict.reason,
-        "effects": effect_rows(best, entries, verdict) if shown else [],
-        "candidates": candidate_rows(entries, best, verdict, rng),
+        "effects": effect_rows(best, hypotheses, verdict) if shown else [],
+        "candidates": candidate_rows(hypotheses, best, verdict, rng),
         "ties": ties,
         "next_experiment": next_experiment(setup, tied) if len(tied) > 1 else "",
         "nominal_refit": refit_table(list(base.terms), list(best.fit.values[: len(base.terms)])),
@@ -168,7 +168,7 @@ def assemble(
             name: {"noise": float(setup.noise[i]), "simulator": float(setup.floor[i])}
             for i, name in enumerate(replayer.signals)
         },
-        "residual_model_error": flexible,
+        "residual_model_error": residual_model_error,
         "seconds": 0.0,
         "repaired_model": "repaired.xml",
         "effects_file": "effects.yaml",
@@ -177,13 +177,13 @@ def assemble(
     return Report(data, measured, nominal, repaired, replayer)
 
 
-def effect_rows(best: Entry, entries: list[Entry], verdict: Verdict) -> list[dict[str, Any]]:
+def effect_rows(best: Hypothesis, hypotheses: list[Hypothesis], verdict: Verdict) -> list[dict[str, Any]]:
     """What the report says of each named effect."""
     out = []
     bounds = intervals(best)
-    shares = effect_probability(best, entries, verdict.probability)
+    shares = effect_probability(best, hypotheses, verdict.probability)
     for term, value, (low, high), share in zip(best.terms, best.values, bounds, shares, strict=True):
-        columns = [numbers(term.effect, term.names, x) for x in (value, low, high)]
+        columns = [effect_parameters(term.effect, term.names, x) for x in (value, low, high)]
         units = dict(zip(term.names, term.units, strict=True))
         sums = sums_of(term.effect)
         out.append(
@@ -206,18 +206,18 @@ def effect_rows(best: Entry, entries: list[Entry], verdict: Verdict) -> list[dic
 
 
 def candidate_rows(
-    entries: list[Entry], best: Entry, verdict: Verdict, rng: np.random.Generator
+    hypotheses: list[Hypothesis], best: Hypothesis, verdict: Verdict, rng: np.random.Generator
 ) -> list[dict[str, Any]]:
     """Ranked: what is named, what ties, then by error and size, first what has no more effects than what is named."""
     front = [best.key, *(e.key for e, _ in verdict.ties)]
     size = len(best.errors)
 
-    def order(e: Entry) -> tuple[int, bool, float]:
+    def order(e: Hypothesis) -> tuple[int, bool, float]:
         place = front.index(e.key) if e.key in front else len(front)
         return place, e.effects > best.effects, e.error * (1 + e.complexity / size)
 
     out = []
-    for e in sorted(entries, key=order)[:MAX_CANDIDATES]:
+    for e in sorted(hypotheses, key=order)[:MAX_CANDIDATES]:
         interval = judge.gain(e.errors, np.zeros(size), 0.90, rng)
         out.append(
             {

@@ -16,7 +16,7 @@ from mpc_sgft.command.errors import UserError, from_config
 from mpc_sgft.learning.agent import Agent
 from mpc_sgft.learning.world_model import WorldModel
 from mpc_sgft.storage import checkpoint
-from planners.memory import keep_freed_memory
+from planners.malloc import keep_freed_memory
 
 
 def device(cfg: DictConfig) -> torch.device:

@@ -21,7 +21,7 @@ import numpy as np
 
 from envs.effects import load
 from mpc_sgft.diagnose import diagnose
-from mpc_sgft.diagnose.candidates.effect_facts import kind_of
+from mpc_sgft.diagnose.candidates.effect_facts import effect_class
 from mpc_sgft.diagnose.candidates.effect_table import TABLE
 from mpc_sgft.diagnose.data.measured import write_csv
 from mpc_sgft.diagnose.deployed import diagnose_run
@@ -32,7 +32,7 @@ PENDULUM = """<mujoco><option timestep="0.002" integrator="implicitfast"/><world
 HIDDEN = {"viscous_friction": {"coefficient": 0.05}}
 NOISE = 1e-4  # [rad]
 FINE = 10  # steps of the hidden machine in one sample
-NAMES = [name for name in TABLE if kind_of(name).place != "geom"]  # nothing touches a pendulum
+NAMES = [name for name in TABLE if effect_class(name).place != "geom"]  # nothing touches a pendulum
 PARTS = (5, 10, len(NAMES))
 DURATIONS = (4.0, 8.0, 16.0, 32.0)  # [s]
 

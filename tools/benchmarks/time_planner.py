@@ -27,7 +27,7 @@ from tensordict import TensorDict
 from mpc_sgft.learning.agent import Agent
 from mpc_sgft.learning.world_model import WorldModel
 from mpc_sgft.runs.collect import planner_policy
-from planners.memory import keep_freed_memory
+from planners.malloc import keep_freed_memory
 from planners.mppi import MPPI
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -170,7 +170,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--quick", action="store_true", help="3 repeats instead of 20, one environment")
     parser.add_argument("--sizes", nargs="+", default=["small", "1M", "5M"], choices=known)
     parser.add_argument("--threads", nargs="+", type=int, default=[1, 2], choices=(1, 2))
-    parser.add_argument("--default-malloc", action="store_true", help="without planners.memory.keep_freed_memory()")
+    parser.add_argument("--default-malloc", action="store_true", help="without planners.malloc.keep_freed_memory()")
     parser.add_argument("--out", type=Path, default=ROOT / "results/timing/time_planner.csv")
     args = parser.parse_args(arguments)
     malloc = "default" if args.default_malloc or not keep_freed_memory() else "kept"

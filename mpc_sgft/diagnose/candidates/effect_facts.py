@@ -13,44 +13,44 @@ from functools import cache
 from importlib import import_module
 
 from envs.effects.base import Effect, available
-from mpc_sgft.diagnose.candidates.effect_table import TABLE, Par, Row, Scales
+from mpc_sgft.diagnose.candidates.effect_table import TABLE, EffectFacts, Parameter, TypicalSizes
 
 HOOKS = ("edit_spec", "ctrl", "friction", "measured")  # what can be done to a recording
 START = 0.1  # typical sizes from no effect
 
 
-def kind_of(name: str) -> type[Effect]:
+def effect_class(name: str) -> type[Effect]:
     return import_module(f"envs.effects.{name}").EFFECT
 
 
 def possible() -> list[str]:
     """Effects that a recording may show."""
-    return [*(n for n in TABLE if n in available()), *(n for n in available() if n not in TABLE and row_of(n))]
+    return [*(n for n in TABLE if n in available()), *(n for n in available() if n not in TABLE and facts_of(n))]
 
 
-def row_of(name: str) -> Row | None:
+def facts_of(name: str) -> EffectFacts | None:
     """What to know of an effect; None if a recording cannot show it, or its units are no mechanical ones."""
-    return TABLE[name] if name in TABLE else _row(kind_of(name))
+    return TABLE[name] if name in TABLE else _facts_from_units(effect_class(name))
 
 
 @cache
-def _row(kind: type[Effect]) -> Row | None:
+def _facts_from_units(kind: type[Effect]) -> EffectFacts | None:
     """One parameter for each field, neutral at its default, as large as force, speed and travel make its unit."""
     if all(getattr(kind, hook) is getattr(Effect, hook) for hook in HOOKS):
         return None
     parameters = {}
     for f in fields(kind):
-        size, neutral = size_of(kind.units.get(f.name, "")), f.default
+        size, neutral = size_from_unit(kind.units.get(f.name, "")), f.default
         if f.name == "at":
             continue
         if size is None or not isinstance(neutral, int | float):
             return None
         one_sided = kind.bounds.get(f.name, (-math.inf, math.inf))[0] >= neutral
-        parameters[f.name] = Par(float(neutral), size, (START,) if one_sided else (START, -START))
-    return Row(parameters)
+        parameters[f.name] = Parameter(float(neutral), size, (START,) if one_sided else (START, -START))
+    return EffectFacts(parameters)
 
 
-def size_of(unit: str) -> Callable[[Scales], float] | None:
+def size_from_unit(unit: str) -> Callable[[TypicalSizes], float] | None:
     """Typical size of a quantity from its unit; None if that is not made of N, m, s and kg.
 
     Args:
@@ -68,7 +68,7 @@ def size_of(unit: str) -> Callable[[Scales], float] | None:
     if not unit:
         return None
 
-    def size(s: Scales) -> float:
+    def size(s: TypicalSizes) -> float:
         way, time = s.travel ** (power["m"] + power["s"]), s.speed ** -power["s"]
         return s.force ** power["N"] * s.inertia ** power["kg"] * way * time
 

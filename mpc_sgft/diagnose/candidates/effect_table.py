@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 
-class Scales(NamedTuple):
+class TypicalSizes(NamedTuple):
     """Typical sizes at one place: what "large" means there."""
 
     force: float = 1.0  # N or N m, of the joint's generalised force
@@ -22,74 +22,78 @@ class Scales(NamedTuple):
     dt: float = 0.001  # s between samples
 
 
-class Par(NamedTuple):
+class Parameter(NamedTuple):
     """One parameter. Starts and bounds are counted from the neutral value in the typical size."""
 
-    neutral: float | Callable[[Scales], float]
-    size: Callable[[Scales], float]
-    starts: tuple[float | Callable[[Scales], float], ...] = (0.1,)
+    neutral: float | Callable[[TypicalSizes], float]
+    size: Callable[[TypicalSizes], float]
+    starts: tuple[float | Callable[[TypicalSizes], float], ...] = (0.1,)
     low: float = -100.0
     high: float = 100.0
-    hop: Callable[[Scales], float] = lambda s: 0.0  # between values that fit about as well: fits try neighbours
+    hop: Callable[[TypicalSizes], float] = lambda s: 0.0  # between values that fit about as well; fits try them too
 
 
-class Row(NamedTuple):
-    parameters: Mapping[str, Par]
+class EffectFacts(NamedTuple):
+    """What diagnose must know of an effect beside its physics."""
+
+    parameters: Mapping[str, Parameter]
     driven: bool = False  # only where a motor sits
     sums: Mapping[str, tuple[str, str]] = {}  # the effect's parameter -> fitted ones that it is the sum of
     variants: Sequence[Mapping[str, float]] = ({},)  # parameters that are held, one candidate each
 
 
-def _saturated(s: Scales) -> float:
+def _saturated(s: TypicalSizes) -> float:
     """Wherever the motion needs most."""
     return min(s.needed / s.peak, 1.0) - 1
 
 
 _force, _viscous = (lambda s: s.force), (lambda s: s.force / s.speed)
-_tilt = Par(0.0, lambda s: 0.1, (0.2,), -5.0, 5.0)
+_tilt = Parameter(0.0, lambda s: 0.1, (0.2,), -5.0, 5.0)
 
-TABLE: dict[str, Row] = {
-    "viscous_friction": Row({"coefficient": Par(0.0, _viscous)}),
-    "coulomb_friction": Row({"torque": Par(0.0, _force)}),
-    "asymmetric_friction": Row({"forward": Par(0.0, _viscous), "backward": Par(0.0, _viscous)}),
-    "stribeck_friction": Row(
+TABLE: dict[str, EffectFacts] = {
+    "viscous_friction": EffectFacts({"coefficient": Parameter(0.0, _viscous)}),
+    "coulomb_friction": EffectFacts({"torque": Parameter(0.0, _force)}),
+    "asymmetric_friction": EffectFacts({"forward": Parameter(0.0, _viscous), "backward": Parameter(0.0, _viscous)}),
+    "stribeck_friction": EffectFacts(
         {
-            "coulomb": Par(0.0, _force),
-            "excess": Par(0.0, _force, low=0.0),
-            "velocity": Par(0.0, lambda s: s.speed, (0.1, 0.5), 0.01, 3.0),
-            "deflection": Par(0.0, lambda s: 1e-3 * s.travel, (1.0,), 0.1, 50.0),
-            "damping_ratio": Par(0.0, lambda s: 1.0, (0.1,), 0.02, 2.0),
+            "coulomb": Parameter(0.0, _force),
+            "excess": Parameter(0.0, _force, low=0.0),
+            "velocity": Parameter(0.0, lambda s: s.speed, (0.1, 0.5), 0.01, 3.0),
+            "deflection": Parameter(0.0, lambda s: 1e-3 * s.travel, (1.0,), 0.1, 50.0),
+            "damping_ratio": Parameter(0.0, lambda s: 1.0, (0.1,), 0.02, 2.0),
         },
         sums={"static": ("coulomb", "excess")},
         variants=({"deflection": 0.0, "damping_ratio": 0.5}, {}),
     ),
-    "load_dependent_friction": Row({"coefficient": Par(0.0, lambda s: 1.0, (0.05,))}, driven=True),
-    "quadratic_drag": Row({"coefficient": Par(0.0, lambda s: s.force / s.speed**2)}),
-    "joint_stiffness": Row(
+    "load_dependent_friction": EffectFacts({"coefficient": Parameter(0.0, lambda s: 1.0, (0.05,))}, driven=True),
+    "quadratic_drag": EffectFacts({"coefficient": Parameter(0.0, lambda s: s.force / s.speed**2)}),
+    "joint_stiffness": EffectFacts(
         {
-            "stiffness": Par(0.0, lambda s: s.force / s.travel),
-            "rest": Par(lambda s: s.centre, lambda s: s.travel, (0.0, -3.0, 3.0), -5.0, 5.0),
+            "stiffness": Parameter(0.0, lambda s: s.force / s.travel),
+            "rest": Parameter(lambda s: s.centre, lambda s: s.travel, (0.0, -3.0, 3.0), -5.0, 5.0),
         }
     ),
-    "armature": Row({"inertia": Par(0.0, lambda s: s.inertia)}),
-    "backlash": Row({"gap": Par(0.0, lambda s: 0.1 * s.travel, (0.003, 0.03, 0.3), 0.0, 10.0)}, driven=True),
-    "gravity_tilt": Row({"angle": _tilt, "roll": _tilt}, variants=({"roll": 0.0}, {"angle": 0.0}, {})),
-    "payload": Row({"mass": Par(0.0, lambda s: s.mass, (0.2,))}),
-    "contact_friction": Row(
-        {"coefficient": Par(lambda s: s.friction, lambda s: 0.5 * s.friction, (-0.5, 0.5, 2.0), -2.0, 10.0)}
+    "armature": EffectFacts({"inertia": Parameter(0.0, lambda s: s.inertia)}),
+    "backlash": EffectFacts(
+        {"gap": Parameter(0.0, lambda s: 0.1 * s.travel, (0.003, 0.03, 0.3), 0.0, 10.0)}, driven=True
     ),
-    "contact_softness": Row({"time_constant": Par(0.0, lambda s: 0.02, (0.25, 1.0), 0.0, 45.0)}),
-    "actuator_gain": Row({"gain": Par(1.0, lambda s: 1.0, (-0.1, 0.1), -0.95, 2.0)}),
-    "actuator_offset": Row({"offset": Par(0.0, lambda s: s.command, (0.05, -0.05))}),
-    "deadband": Row({"width": Par(0.0, lambda s: s.command, (0.05, 0.3), 0.0, 3.0)}),
-    "torque_saturation": Row(
-        {"limit": Par(lambda s: s.peak, lambda s: s.peak, (-0.15, -0.5, -0.75, -0.88, _saturated), -0.999, 0.0)}
+    "gravity_tilt": EffectFacts({"angle": _tilt, "roll": _tilt}, variants=({"roll": 0.0}, {"angle": 0.0}, {})),
+    "payload": EffectFacts({"mass": Parameter(0.0, lambda s: s.mass, (0.2,))}),
+    "contact_friction": EffectFacts(
+        {"coefficient": Parameter(lambda s: s.friction, lambda s: 0.5 * s.friction, (-0.5, 0.5, 2.0), -2.0, 10.0)}
     ),
-    "sensor_offset": Row({"offset": Par(0.0, lambda s: s.travel, (0.1, -0.1), -3.0, 3.0)}),
-    "sensor_gain": Row({"gain": Par(1.0, lambda s: 1.0, (-0.05, 0.05), -0.8, 2.0)}),
-    "actuator_delay": Row({"delay": Par(0.0, lambda s: 0.02, (0.25, 1.0), 0.0, 15.0, lambda s: s.dt)}),
-    "sensor_delay": Row({"delay": Par(0.0, lambda s: 0.02, (0.25, 1.0), 0.0, 15.0)}),
-    "actuator_lag": Row({"time_constant": Par(0.0, lambda s: 0.02, (0.25, 1.0), 0.0, 15.0)}),
+    "contact_softness": EffectFacts({"time_constant": Parameter(0.0, lambda s: 0.02, (0.25, 1.0), 0.0, 45.0)}),
+    "actuator_gain": EffectFacts({"gain": Parameter(1.0, lambda s: 1.0, (-0.1, 0.1), -0.95, 2.0)}),
+    "actuator_offset": EffectFacts({"offset": Parameter(0.0, lambda s: s.command, (0.05, -0.05))}),
+    "deadband": EffectFacts({"width": Parameter(0.0, lambda s: s.command, (0.05, 0.3), 0.0, 3.0)}),
+    "torque_saturation": EffectFacts(
+        {"limit": Parameter(lambda s: s.peak, lambda s: s.peak, (-0.15, -0.5, -0.75, -0.88, _saturated), -0.999, 0.0)}
+    ),
+    "sensor_offset": EffectFacts({"offset": Parameter(0.0, lambda s: s.travel, (0.1, -0.1), -3.0, 3.0)}),
+    "sensor_gain": EffectFacts({"gain": Parameter(1.0, lambda s: 1.0, (-0.05, 0.05), -0.8, 2.0)}),
+    "actuator_delay": EffectFacts({"delay": Parameter(0.0, lambda s: 0.02, (0.25, 1.0), 0.0, 15.0, lambda s: s.dt)}),
+    "sensor_delay": EffectFacts({"delay": Parameter(0.0, lambda s: 0.02, (0.25, 1.0), 0.0, 15.0)}),
+    "actuator_lag": EffectFacts({"time_constant": Parameter(0.0, lambda s: 0.02, (0.25, 1.0), 0.0, 15.0)}),
 }
 
 # richer effect -> simpler one -> {parameter of the richer: parameter of the simpler that gives the same physics}

@@ -1,7 +1,7 @@
 """Candidates: effects at places, how large they may be, and where a fit should start.
 
-The physics is in envs/effects/<name>.py, and what to know of it in rows.py. Commands are changed before the windows are
-cut, so that delays and lags reach back before a window's start.
+The physics is in envs/effects/<name>.py, and what to know of it in effect_facts.py. Commands are changed before the
+windows are cut, so that delays and lags reach back before a window's start.
 """
 
 from __future__ import annotations
@@ -16,13 +16,18 @@ import numpy as np
 
 from envs.effects.base import Effect, load
 from mpc_sgft.command.errors import UserError, unknown
-from mpc_sgft.diagnose.candidates.effect_facts import kind_of, possible, row_of
-from mpc_sgft.diagnose.candidates.effect_table import INCLUDES, TABLE, Row, Scales
+from mpc_sgft.diagnose.candidates.effect_facts import effect_class, facts_of, possible
+from mpc_sgft.diagnose.candidates.effect_table import INCLUDES, TABLE, EffectFacts, TypicalSizes
 from mpc_sgft.diagnose.data.measured import Array
+from mpc_sgft.diagnose.simulation.delays import DELAYS
 from mpc_sgft.diagnose.simulation.plant import Change, Plant, joint_of
-from mpc_sgft.diagnose.simulation.signals import SIGNALS
 
-HIDDEN = ("velocity", "rest", "deflection", "damping_ratio")  # parameters that mean nothing while the effect is neutral
+IDLE_WHILE_NEUTRAL = (
+    "velocity",
+    "rest",
+    "deflection",
+    "damping_ratio",
+)  # parameters that mean nothing while the effect is neutral
 RICHER = 0.5  # of the simpler effect's size: where a fit of what the richer one does beyond it begins
 LONG = (int(mujoco.mjtGeom.mjGEOM_CAPSULE), int(mujoco.mjtGeom.mjGEOM_CYLINDER))
 
@@ -60,7 +65,9 @@ class Term:
         return f"{self.effect}@{','.join(self.at)}" if self.at else self.effect
 
 
-def candidates(plant: Plant, scales: Mapping[tuple[str, str], Scales], effects: Sequence[str] | None) -> list[Term]:
+def candidates(
+    plant: Plant, scales: Mapping[tuple[str, str], TypicalSizes], effects: Sequence[str] | None
+) -> list[Term]:
     """Every effect that the data may show, at every place it may sit.
 
     Args:
@@ -86,13 +93,17 @@ def candidates(plant: Plant, scales: Mapping[tuple[str, str], Scales], effects: 
     driven = [j for a in plant.actuators if (j := joint_of(plant, a))]
     built: list[Term] = []
     for name in (n for n in known if effects is None or n in effects):
-        kind, row = kind_of(name).place, _row_of(name)
-        for place in driven if row.driven else places[kind]:
-            variants = load_positions(plant, place) if name == "payload" else row.variants
-            built += [make_term(plant, name, place, scales.get((kind, place), Scales()), fixed) for fixed in variants]
+        kind, facts = effect_class(name).place, _facts_of(name)
+        for place in driven if facts.driven else places[kind]:
+            variants = load_positions(plant, place) if name == "payload" else facts.variants
+            built += [
+                make_term(plant, name, place, scales.get((kind, place), TypicalSizes()), fixed) for fixed in variants
+            ]
     for name in effects or []:
         if not any(t.effect == name for t in built):
-            what = "geoms that touch while the machine moves" if kind_of(name).place == "geom" else "a driven joint"
+            what = (
+                "geoms that touch while the machine moves" if effect_class(name).place == "geom" else "a driven joint"
+            )
             raise UserError(f"--effects {name}: it needs {what}, and here there are none; leave it out.")
     return built
 
@@ -116,16 +127,18 @@ def load_positions(plant: Plant, body: str) -> list[dict[str, Any]]:
     return [{"position": [round(float(x), 6) for x in p]} for p in points]
 
 
-def _row_of(name: str) -> Row:
-    row = row_of(name)
-    assert row is not None, name
-    return row
+def _facts_of(name: str) -> EffectFacts:
+    facts = facts_of(name)
+    assert facts is not None, name
+    return facts
 
 
-def make_term(plant: Plant, name: str, place: str, scales: Scales, fixed: Mapping[str, Any] | None = None) -> Term:
+def make_term(
+    plant: Plant, name: str, place: str, scales: TypicalSizes, fixed: Mapping[str, Any] | None = None
+) -> Term:
     """One effect at one place ("" for the whole scene)."""
-    kind = kind_of(name)
-    parameters = {p: par for p, par in _row_of(name).parameters.items() if p not in (fixed or {})}
+    kind = effect_class(name)
+    parameters = {p: par for p, par in _facts_of(name).parameters.items() if p not in (fixed or {})}
     pars = list(parameters.values())
     hard = np.array([kind.bounds.get(p, (-np.inf, np.inf)) for p in parameters]).reshape(-1, 2)
     sizes = np.minimum([par.size(scales) for par in pars], hard[:, 1] - hard[:, 0])  # at rest, sizes may be anything
@@ -153,7 +166,11 @@ def make_term(plant: Plant, name: str, place: str, scales: Scales, fixed: Mappin
 
 def settings(term: Term, value: Array) -> dict[str, Any]:
     """What effects.yaml says of one effect."""
-    return {**numbers(term.effect, term.names, value), **term.fixed, **({"at": list(term.at)} if term.at else {})}
+    return {
+        **effect_parameters(term.effect, term.names, value),
+        **term.fixed,
+        **({"at": list(term.at)} if term.at else {}),
+    }
 
 
 def as_gap(found: Iterable[tuple[str, dict[str, Any]]]) -> dict[str, Any]:
@@ -168,12 +185,12 @@ def as_gap(found: Iterable[tuple[str, dict[str, Any]]]) -> dict[str, Any]:
     return {name: places[0] if len(places) == 1 else places for name, places in every.items()}
 
 
-def numbers(effect: str, names: Sequence[str], x: Array) -> dict[str, float]:
+def effect_parameters(effect: str, names: Sequence[str], x: Array) -> dict[str, float]:
     """The effect's own parameters from the fitted ones."""
     fitted = dict(zip(names, map(float, x), strict=True))
     sums = sums_of(effect)
     inner = (
-        {part for parts in sums.values() for part in parts} - set(f.name for f in fields(kind_of(effect)))
+        {part for parts in sums.values() for part in parts} - set(f.name for f in fields(effect_class(effect)))
         if sums
         else set()
     )
@@ -190,9 +207,9 @@ def sums_of(effect: str) -> Mapping[str, tuple[str, str]]:
 def _change(
     plant: Plant, name: str, at: tuple[str, ...], names: tuple[str, ...], fixed: Mapping[str, Any], x: Array
 ) -> Change:
-    values = numbers(name, names, x)
-    if name in SIGNALS:
-        return SIGNALS[name](plant, at, values)
+    values = effect_parameters(name, names, x)
+    if name in DELAYS:
+        return DELAYS[name](plant, at, values)
     effect = load({name: {**values, **fixed, **({"at": list(at)} if at else {})}})[0]
     kind = type(effect)
     joints, actuators = plant.joints, plant.actuators
@@ -238,10 +255,12 @@ def enrich(rich: Term, simple: Term, value: Array) -> list[Array]:
     parameters that idle cannot be told from one another.
     """
     mapping = _shared(rich, simple)
-    own = [n not in mapping and n not in HIDDEN for n in rich.names]
+    own = [n not in mapping and n not in IDLE_WHILE_NEUTRAL for n in rich.names]
     same = []
     for start in rich.starts:
-        x = np.array([s if n in HIDDEN else z for n, s, z in zip(rich.names, start, rich.neutral, strict=True)])
+        x = np.array(
+            [s if n in IDLE_WHILE_NEUTRAL else z for n, s, z in zip(rich.names, start, rich.neutral, strict=True)]
+        )
         for i, name in enumerate(rich.names):
             if name in mapping:
                 x[i] = value[simple.names.index(mapping[name])]

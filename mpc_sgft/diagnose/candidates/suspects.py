@@ -16,7 +16,7 @@ import numpy as np
 from envs.effects.base import Effect, load
 from envs.task import AbstractTask
 from mpc_sgft.command.errors import unknown
-from mpc_sgft.diagnose.candidates.effect_facts import kind_of
+from mpc_sgft.diagnose.candidates.effect_facts import effect_class
 from mpc_sgft.diagnose.candidates.library import Term, as_gap
 from mpc_sgft.diagnose.data.measured import Array
 
@@ -50,7 +50,7 @@ class Suspect:
         return tuple(load({self.effect: self.write(values)}))
 
     def term(self) -> Term:
-        units = kind_of(self.effect).units
+        units = effect_class(self.effect).units
         first = next(iter(units.values()), "1")
         return Term(
             effect=self.effect,

@@ -1,1 +1,1 @@
-"""Measured episodes, and what can be said of them without a model of the world."""
+"""Measured episodes: read, checked, smoothed and cut into windows; nothing is simulated here."""

@@ -1,1 +1,1 @@
-"""A deployment's run folder, read as a chain: command to drive, drive to motion, motion to observation."""
+"""A deployment as a chain, command to drive to motion to observation, and retraining on what it lacks."""

@@ -19,8 +19,8 @@ from envs.task import AbstractTask
 from mpc_sgft.diagnose.candidates.library import Term
 from mpc_sgft.diagnose.data.measured import Array, Index
 from mpc_sgft.diagnose.data.smooth import noise_of
-from mpc_sgft.diagnose.deployments.command_link import Commands, measured_drive
-from mpc_sgft.diagnose.deployments.motion_link import SUB, Cuts, Motion, at_times, commands
+from mpc_sgft.diagnose.deployments.command_link import ServoCommands, measured_drive
+from mpc_sgft.diagnose.deployments.motion_link import JOINT_SAMPLES, Motion, StepWindows, acts_on_command, at_times
 from mpc_sgft.diagnose.deployments.recordings import Deployment, joint_columns
 
 RESOLUTION = 1e-4  # [m] of an observed position, beside its noise
@@ -35,7 +35,13 @@ QUARTER = 0.3186  # lower quartile of |x| of a standard normal
 
 
 class Prediction(NamedTuple):
-    """Of K models: change of control [K, W, n SUB, nu], joint error [K, W, n SUB, nj], observation [K, W, n, O]."""
+    """What K models predict; J is JOINT_SAMPLES.
+
+    Attributes:
+        drive: Change of control, [K, W, n J, nu].
+        joints: Error of the joints, [K, W, n J, nj].
+        observation: At the end of each control step, [K, W, n, O].
+    """
 
     drive: Array
     joints: Array
@@ -61,13 +67,13 @@ class Chain:
         self.noise = observation_noise(deployment)  # [O]
         rest = max(REST, 4 * float(self.noise.max()))
         self.motion = Motion(deployment, measured, length, rest)
-        self.commands = Commands(task, self.episodes)
+        self.commands = ServoCommands(task, self.episodes)
         self._choose(most, rest)
         self.blocks = length
         w = self.windows
         pairs = list(zip(w.episode, w.start, strict=True))
-        within = task.control_dt / SUB * np.arange(length * SUB + 1)
-        self.times = task.control_dt * w.start[:, None] + within  # [W, 1 + n SUB] since the episode's start
+        within = task.control_dt / JOINT_SAMPLES * np.arange(length * JOINT_SAMPLES + 1)
+        self.times = task.control_dt * w.start[:, None] + within  # [W, 1 + n JOINT_SAMPLES] since the episode's start
         told = [at_times(self.episodes[i].time, measured[i], t) for i, t in zip(w.episode, self.times, strict=True)]
         self.drive = changes_since_start(np.stack(told))
         self.observed = np.stack([self.episodes[i].observation[s + 1 : s + 1 + length] for i, s in pairs])
@@ -82,7 +88,7 @@ class Chain:
         }
 
     @property
-    def windows(self) -> Cuts:
+    def windows(self) -> StepWindows:
         """The windows that are compared."""
         return self.motion.windows
 
@@ -110,8 +116,8 @@ class Chain:
         return [_bend(r).reshape(*r.shape[:2], -1) for r in raw]
 
     def _drive(self, changes: Sequence[tuple[Effect, ...]]) -> Array:
-        """Control at the servos at the compared times, since the window's start, [K, W, n SUB, nu]."""
-        keys = [("drive", tuple(e for e in effects if commands(e))) for effects in changes]
+        """Control at the servos at the compared times, since the window's start, [K, W, n JOINT_SAMPLES, nu]."""
+        keys = [("drive", tuple(e for e in effects if acts_on_command(e))) for effects in changes]
         new = list(dict.fromkeys(k for k in keys if k not in self._cache))
         rows = np.round(self.times / self.task.sim_dt).astype(int) - 1
         found = {k: self._cache[k][0] for k in keys if k in self._cache}
@@ -125,7 +131,7 @@ class Chain:
         return np.stack([found[k] for k in keys])
 
     def _motion(self, effects: tuple[Effect, ...], pick: Index) -> tuple[Array, Array]:
-        mine = tuple(e for e in effects if not commands(e))
+        mine = tuple(e for e in effects if not acts_on_command(e))
         key = ("motion", mine, pick.tobytes())
         if key not in self._cache:
             out = self.motion.simulate([mine], pick)
@@ -163,7 +169,7 @@ class Chain:
         finer = Motion(deployment, measured, w.samples, rest, finer=2)
         finer.windows = w
         spread: list[list[Array]] = [[], []]
-        for change in slippery(self.task):
+        for change in friction_variants(self.task):
             out, fine = m.simulate([change] * len(nudges), nudge=nudges), finer.simulate([change])
             for mine, x, y in zip(spread, out, fine, strict=True):
                 mine.append(SIGMA * np.median(np.abs(np.concatenate([x[1:], y]) - x[0]), 0))
@@ -176,7 +182,7 @@ class Chain:
         self.drive_scale = DRIVE_SHARE * float(np.std(np.concatenate(measured), axis=0).max()) + 1e-9
 
 
-def slippery(task: AbstractTask) -> list[tuple[Effect, ...]]:
+def friction_variants(task: AbstractTask) -> list[tuple[Effect, ...]]:
     """The nominal scene, and with all objects' friction lower and higher."""
     model = task.spec().compile()
     free = np.flatnonzero(model.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE))

@@ -45,7 +45,7 @@ def measured_drive(model: mujoco.MjModel, episode: Rollout) -> Array:
     return out
 
 
-class Commands:
+class ServoCommands:
     """What the interface sends to the servos for the actions of all episodes.
 
     Args:

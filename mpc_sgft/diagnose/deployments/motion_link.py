@@ -27,11 +27,11 @@ from mpc_sgft.diagnose.data.measured import Array, Index
 from mpc_sgft.diagnose.deployments.recordings import Deployment, joint_columns
 
 STATE = mujoco.mjtState.mjSTATE_FULLPHYSICS
-SUB = 5  # joints are compared so often in a control step
+JOINT_SAMPLES = 5  # joints are compared so often in a control step
 EXPLODED = 1e3  # predictions are clipped here, so that an unstable candidate is bad, not infinite
 
 
-class Cuts(NamedTuple):
+class StepWindows(NamedTuple):
     """W windows of n control steps.
 
     Attributes:
@@ -48,7 +48,7 @@ class Outcome(NamedTuple):
     """What K models predict in windows.
 
     Attributes:
-        joints: Predicted minus measured, [K, W, n SUB, nj].
+        joints: Predicted minus measured, [K, W, n JOINT_SAMPLES, nj].
         observation: As sensed at the end of each control step, [K, W, n, O].
     """
 
@@ -117,7 +117,7 @@ class Motion:
         steps, nu, nj = w.samples * self.substeps, self.model.nu, len(self.qadr)
         state = np.zeros((len(pick), mujoco.mj_stateSize(m, STATE)))
         inputs = np.zeros((len(pick), steps, m.nu))
-        measured = np.empty((len(pick), w.samples * SUB, nj))
+        measured = np.empty((len(pick), w.samples * JOINT_SAMPLES, nj))
         for i in np.unique(w.episode[pick]):
             mine, e = np.flatnonzero(w.episode[pick] == i), self.episodes[i]
             begin = np.maximum(w.start[pick[mine]] * self.task.control_dt - late, e.time[0])  # [s]
@@ -141,11 +141,13 @@ class Motion:
         return Outcome(joints, sensed(self.task, effects, flat).reshape(len(pick), w.samples, -1))
 
     def _compared(self) -> Index:
-        """Physics steps after which joints are compared, counted from 1, [n SUB]."""
-        return np.round(np.arange(1, self.windows.samples * SUB + 1) * self.substeps / SUB).astype(int)
+        """Physics steps after which joints are compared, counted from 1, [n JOINT_SAMPLES]."""
+        return np.round(np.arange(1, self.windows.samples * JOINT_SAMPLES + 1) * self.substeps / JOINT_SAMPLES).astype(
+            int
+        )
 
     def _model(self, effects: list[Effect]) -> mujoco.MjModel:
-        edits = [e for e in effects if not commands(e) and type(e).edit_spec is not Effect.edit_spec]
+        edits = [e for e in effects if not acts_on_command(e) and type(e).edit_spec is not Effect.edit_spec]
         if not edits:
             return self.model
         spec = self.spec.copy()
@@ -154,7 +156,7 @@ class Motion:
         return spec.compile()
 
 
-def commands(effect: Effect) -> bool:
+def acts_on_command(effect: Effect) -> bool:
     """Whether an effect acts before the servos, on the command alone."""
     if isinstance(effect, FrameRotation):
         return effect.at == "base"
@@ -181,7 +183,7 @@ def unsensed(task: AbstractTask, effects: Sequence[Effect], read: Array) -> Arra
     return np.linalg.lstsq((probe[1:] - probe[0]).T, (read - probe[0]).T, rcond=None)[0].T
 
 
-def cut(motion: Motion, length: int, rest: float) -> Cuts:
+def cut(motion: Motion, length: int, rest: float) -> StepWindows:
     """Windows that begin where the objects rest, just before they move if they are about to.
 
     Raises:
@@ -206,4 +208,4 @@ def cut(motion: Motion, length: int, rest: float) -> Cuts:
         raise UserError(
             f"only {len(start)} windows of {length} steps in which objects first rest: record more episodes."
         )
-    return Cuts(np.array(episode), np.array(start), length)
+    return StepWindows(np.array(episode), np.array(start), length)

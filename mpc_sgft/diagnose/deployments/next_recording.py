@@ -9,7 +9,7 @@ import numpy as np
 from envs.backends.sim import SimBackend
 from mpc_sgft.diagnose.data.measured import Array
 from mpc_sgft.diagnose.deployments.chain import RESOLUTION, Chain, effects_of
-from mpc_sgft.diagnose.fitting.hypothesis import Entry
+from mpc_sgft.diagnose.fitting.hypothesis import Hypothesis
 from mpc_sgft.diagnose.verdict.next_experiment import best_of, separation
 
 STARTS = 4  # simulated episodes for each proposal
@@ -29,7 +29,7 @@ def _proposals() -> dict[str, Callable[[Array], Array]]:
     }
 
 
-def next_experiment(chain: Chain, tied: Sequence[Entry]) -> str:
+def next_experiment(chain: Chain, tied: Sequence[Hypothesis]) -> str:
     """Words for the proposal that separates the tied candidates best, and by how many times the noise."""
     scale = np.hypot(RESOLUTION, chain.noise)
     backends = [

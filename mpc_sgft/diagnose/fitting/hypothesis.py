@@ -15,7 +15,7 @@ from mpc_sgft.diagnose.fitting.prepare import Setup
 SEEN = 1e-3  # a parameter whose derivative is smaller than this share of its effect's largest changes nothing
 
 
-class Entry(NamedTuple):
+class Hypothesis(NamedTuple):
     """A set of effects, fitted and judged.
 
     Attributes:
@@ -59,7 +59,7 @@ class Entry(NamedTuple):
         return float(self.errors.mean())
 
 
-def entry(setup: Setup[Any], f: Fit) -> Entry:
+def judge_fit(setup: Setup[Any], f: Fit) -> Hypothesis:
     """Judge a fit on all windows: fitted ones by leaving out their block, the others as they are.
 
     Leaving out is to first order. Where that foretells more than the fit and no effect do, the rest of the data do not
@@ -79,4 +79,4 @@ def entry(setup: Setup[Any], f: Fit) -> Entry:
     ends = np.cumsum([len(t.size) for t in f.terms])
     norms = np.split(np.sqrt((f.J**2).sum((0, 1))), ends[:-1])[nominal:]  # of each effect's parameters
     seen = sum(int((own > SEEN * max(float(own.max()), 1e-12)).sum()) for own in norms if len(own))
-    return Entry(f, len(f.terms) - nominal, errors, fitted, seen)
+    return Hypothesis(f, len(f.terms) - nominal, errors, fitted, seen)

@@ -50,12 +50,12 @@ def gain(worse: Array, better: Array, level: float, rng: np.random.Generator) ->
     return Interval(mean, min(float(low), mean - half), max(float(high), mean + half))
 
 
-def worth(error: float) -> float:
+def least_gain(error: float) -> float:
     """The smallest drop of an error, in log(1 + e), that is worth a name."""
     return max(MIN_GAIN, MIN_SHARE * error)
 
 
-def leaves(error: float, nominal: float, share: float) -> bool:
+def leaves_much(error: float, nominal: float, share: float) -> bool:
     """Whether a set leaves more than this share of the nominal model's squared error above noise, and enough to matter.
 
     Args:
@@ -72,7 +72,7 @@ def credible(
     parts: int = 1,
     least: float | None = None,
     one_window: bool = False,
-    odds: float | None = None,
+    log_odds: float | None = None,
 ) -> bool:
     """Whether the gain is real, in more than one window, and large enough to matter.
 
@@ -82,26 +82,26 @@ def credible(
         parts: Of each window.
         least: Gain that matters, in log(1 + e); what is worth a name if None.
         one_window: Whether several parts of one window will do.
-        odds: Logarithm of how much likelier the data are with the better one; None where that is not known.
+        log_odds: Logarithm of how much likelier the data are with the better one; None where that is not known.
     """
     g = gain(worse, better, 2 * GAIN_LEVEL - 1, rng)
     drops = (worse - better).reshape(-1, 1 if one_window else parts).mean(1)
     elsewhere = (drops.sum() - drops.max()) / max(len(drops) - 1, 1)
-    least = worth(float(worse.mean())) if least is None else least
-    real = g.low > 0 or odds is not None and odds > np.log(SURE_ODDS)
+    least = least_gain(float(worse.mean())) if least is None else least
+    real = g.low > 0 or log_odds is not None and log_odds > np.log(SURE_ODDS)
     return real and g.mean > least and bool(elsewhere > min(ELSEWHERE, ELSEWHERE_SHARE * least))
 
 
-def worse(rival: Array, best: Array, rng: np.random.Generator, odds: float | None = None) -> bool:
+def ruled_out(rival: Array, best: Array, rng: np.random.Generator, log_odds: float | None = None) -> bool:
     """Whether a rival of the same size can be ruled out.
 
     Args:
         rival, best: Errors of the same parts of windows, [W].
         rng: For the bootstrap.
-        odds: Logarithm of how much likelier the data are with the best; None where that is not known.
+        log_odds: Logarithm of how much likelier the data are with the best; None where that is not known.
     """
     g = gain(rival, best, 2 * TIE_LEVEL - 1, rng)
-    return g.mean > TIE_GAIN and bool(g.low > 0 if odds is None else odds > np.log(TIE_ODDS))
+    return g.mean > TIE_GAIN and bool(g.low > 0 if log_odds is None else log_odds > np.log(TIE_ODDS))
 
 
 def win_shares(errors: Array, complexity: Array, rng: np.random.Generator, points: int) -> Array:

@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 
 from mpc_sgft.command.errors import UserError
-from mpc_sgft.diagnose.candidates.effect_table import Scales
+from mpc_sgft.diagnose.candidates.effect_table import TypicalSizes
 from mpc_sgft.diagnose.candidates.library import Term
 from mpc_sgft.diagnose.data.measured import Array, Episode, Index
 from mpc_sgft.diagnose.data.smooth import noise_of, smooth
@@ -136,7 +136,7 @@ def prepare(
     return _setup(replayer, noise, fitted, held, base, nominal)
 
 
-def around(setup: Setup[Problem], f: Fit, plant: Plant) -> Setup[Problem]:
+def near_fit(setup: Setup[Problem], f: Fit, plant: Plant) -> Setup[Problem]:
     """The same windows, with what errors of a start and of the simulator's steps do to a fit, not to the nominal model.
 
     Where a joint sticks, for one, it no longer matters how fast it was taken to be.
@@ -146,7 +146,7 @@ def around(setup: Setup[Problem], f: Fit, plant: Plant) -> Setup[Problem]:
         f: The fit.
         plant: The scene in other steps.
     """
-    replayer = setup.problem.replayer.of(plant)
+    replayer = setup.problem.replayer.with_plant(plant)
     return _setup(replayer, setup.noise, setup.fitted, setup.held, f, setup.baseline.terms)
 
 
@@ -158,7 +158,7 @@ def _setup(
     problem = _problem(replayer, noise, own, near.terms, near.values)
     base = fit(problem, nominal, near.values[: len(nominal)], fitted)
     parts = max(1, -(-UNITS // len(replayer.windows.start)))
-    blocks = cut(len(fitted))
+    blocks = leave_out_blocks(len(fitted))
     share = problem.floor_shares.sum(0)[np.concatenate([fitted, held])]
     least = by_parts(share, parts)  # less says nothing of the machine
 
@@ -169,7 +169,7 @@ def _setup(
     return Setup(problem, fitted, held, blocks, base, noise, floor, judged, NOISE + QUIET, parts, stepping, near)
 
 
-def cut(fitted: int) -> Index:
+def leave_out_blocks(fitted: int) -> Index:
     """Block of each fitted window, [W]: of neighbouring windows."""
     return np.minimum(np.arange(fitted) * BLOCKS // fitted, BLOCKS - 1)
 
@@ -221,11 +221,13 @@ def discrepancy(replayer: Replayer, terms: Sequence[Term], values: Sequence[Arra
         """In steps of this share."""
         spec = plant.spec.copy()
         spec.option.timestep = plant.model.opt.timestep / share
-        return replayer.of(Plant(spec)).simulate([change])[0]
+        return replayer.with_plant(Plant(spec)).simulate([change])[0]
 
     predicted, half, quarter = replayer.simulate([change])[0], simulate(2), simulate(4)
     step = np.maximum.accumulate(np.abs(quarter - half), 1)
-    clock = replayer.read(AFTER).simulate([change])[0] - replayer.read(BEFORE).simulate([change])[0]
+    clock = (
+        replayer.with_forces_read(AFTER).simulate([change])[0] - replayer.with_forces_read(BEFORE).simulate([change])[0]
+    )
     unsure = (w.acting == EITHER).all(-1)[..., None]
     floor = np.stack([step, np.where(unsure, 0.0, clock)])
     return Discrepancy(quarter - predicted, floor, np.where(unsure, np.abs(clock) / 2, 0.0))
@@ -252,7 +254,7 @@ def _problem(
     return Problem(replayer, noise, own, sd, sensitivity)
 
 
-def scales(plant: Plant, replayer: Replayer) -> dict[tuple[str, str], Scales]:
+def typical_sizes(plant: Plant, replayer: Replayer) -> dict[tuple[str, str], TypicalSizes]:
     """Typical sizes by (kind, name), from the measured motion: of every joint, actuator, signal and body, and of geoms
     that touch others along it."""
     m = plant.model
@@ -282,17 +284,17 @@ def scales(plant: Plant, replayer: Replayer) -> dict[tuple[str, str], Scales]:
     dt, out = replayer.dt, {}
     for i, joint in enumerate(plant.joints):
         middle = float(np.median(q[:, i]))
-        at = Scales(float(force[i]), float(speed[i]), float(travel[i]), middle, float(inertia[i]), dt=dt)
+        at = TypicalSizes(float(force[i]), float(speed[i]), float(travel[i]), middle, float(inertia[i]), dt=dt)
         out["joint", joint] = out["signal", f"qpos/{joint}"] = at
     for i, name in enumerate(plant.actuators):
         joint = joint_of(plant, name)
-        at = out["joint", joint] if joint else Scales(dt=dt)
+        at = out["joint", joint] if joint else TypicalSizes(dt=dt)
         command = float(np.sqrt(np.mean(u[:, i] ** 2))) + 1e-9
         most = float(peak[i]) + 1e-9
         ask = float(needed[m.joint(joint).dofadr[0]] / abs(m.actuator(name).gear[0])) if joint else most
         out["actuator", name] = at._replace(command=command, peak=most, needed=ask)
     for name in plant.bodies:
-        out["body", name] = Scales(mass=float(m.body_mass[m.body(name).id]), dt=dt)
+        out["body", name] = TypicalSizes(mass=float(m.body_mass[m.body(name).id]), dt=dt)
     for name, friction in touching.items():
-        out["geom", name] = Scales(friction=friction, dt=dt)
+        out["geom", name] = TypicalSizes(friction=friction, dt=dt)
     return out

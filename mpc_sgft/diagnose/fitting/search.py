@@ -12,9 +12,9 @@ from mpc_sgft.diagnose.candidates.library import Term, includes, simplify
 from mpc_sgft.diagnose.data.measured import Array
 from mpc_sgft.diagnose.fitting import judge
 from mpc_sgft.diagnose.fitting.fit import Fit, fit, robust, typical
-from mpc_sgft.diagnose.fitting.hypothesis import Entry, entry
+from mpc_sgft.diagnose.fitting.hypothesis import Hypothesis, judge_fit
 from mpc_sgft.diagnose.fitting.prepare import Setup
-from mpc_sgft.diagnose.fitting.screen import Effort, Proposal, couple, key_of, proposals, screen, sharpen, spread
+from mpc_sgft.diagnose.fitting.screening import Effort, Proposal, key_of, pair_up, proposals, quick_fits, screen, spread
 
 FIRST, NEXT = (1.0, 0.1, 0.01), (0.3,)  # how far from no effect the fits of a first effect start, and of further ones
 REJUDGED = 6  # sets that are judged anew, half of them however bad they are
@@ -37,7 +37,7 @@ def search(
     report: Callable[[str, float], None] = lambda what, done: None,
     effort: Effort = Effort(),  # noqa: B008, it is a tuple
     nearer: Callable[[Fit], Setup[Any]] | None = None,
-) -> tuple[Setup[Any], list[Entry]]:
+) -> tuple[Setup[Any], list[Hypothesis]]:
     """All sets that were fitted, baseline first, and the problem that they were fitted to.
 
     Args:
@@ -49,18 +49,18 @@ def search(
         effort: How widely.
         nearer: The problem as a fit sees it: where one effect leaves more than noise, the search goes on in that.
     """
-    found = {frozenset(): entry(setup, setup.baseline)}
+    found = {frozenset(): judge_fit(setup, setup.baseline)}
     beam, best, pairs = list(found.values()), found[frozenset()], []
     most, wide = max_effects, 1
     for level in range(max_effects + 1):  # one more, in which simple effects may still be replaced by richer ones
-        new: dict[frozenset[str], Entry] = {}
+        new: dict[frozenset[str], Hypothesis] = {}
         full = effort.full[min(level, len(effort.full) - 1)] * wide
         for b, parent in enumerate(beam):
             report(f"{' + '.join(parent.names) or 'nominal'}", (level + b / len(beam)) / (max_effects + 1))
             options = proposals(parent, terms, most, FIRST if not level else NEXT)
-            ranked, samples = screen(setup, parent, options, effort.screen)
+            ranked, samples = screen(setup, parent, options, effort.screen_windows)
             if not level:
-                pairs = couple(parent, samples, setup, effort) if max_effects > 1 and effort.pairs else []
+                pairs = pair_up(parent, samples, setup, effort) if max_effects > 1 and effort.pairs else []
             new |= promising(setup, parent, ranked, full, found | new, effort)
         if level == 1:
             left = [p for p in pairs if key_of(setup, p.terms) not in new]
@@ -79,26 +79,26 @@ def search(
             beam = beam[:1]  # pairs may do what nothing does alone
         if nearer and level == 0 and best.effects and best.error >= setup.quiet:
             setup = nearer(best.fit)
-            found = {e.key: e for e in again(setup, list(found.values()), best)}
+            found = {e.key: e for e in refit(setup, list(found.values()), best)}
             beam = sorted((e for e in found.values() if e.effects), key=lambda e: e.error)[:count]
             best = beam[0]
         if best.error < setup.quiet:
             beam, most, wide = beam[:1], min(most, PAIR), WIDE
     best = min(found.values(), key=lambda e: e.error)
-    if effort.exchange and best.effects > 1 and judge.leaves(best.error, found[frozenset()].error, MUCH):
+    if effort.exchange and best.effects > 1 and judge.leaves_much(best.error, found[frozenset()].error, MUCH):
         found |= exchange(setup, best, found, terms, effort)
     return setup, list((found | swaps(setup, found, terms, effort)).values())
 
 
 def promising(
     setup: Setup[Any],
-    parent: Entry,
+    parent: Hypothesis,
     ranked: list[Proposal],
     full: int,
-    found: Mapping[frozenset[str], Entry],
+    found: Mapping[frozenset[str], Hypothesis],
     effort: Effort,
-    best: Entry | None = None,
-) -> dict[frozenset[str], Entry]:
+    best: Hypothesis | None = None,
+) -> dict[frozenset[str], Hypothesis]:
     """Full fits of the best proposals, those that are new or better than before.
 
     Args:
@@ -116,35 +116,35 @@ def promising(
         starts.setdefault(key_of(setup, p.terms), []).append(p)
     richer = [p for ps in starts.values() for p in ps[:STARTS]]
     others = [p for p in ranked if len(p.terms) > len(parent.fit.terms)][: 2 * full]
-    new: dict[frozenset[str], Entry] = {}
+    new: dict[frozenset[str], Hypothesis] = {}
     for some, count in ((richer, len(starts)), (others, full)):
         sets: dict[frozenset[str], Proposal] = {}
-        for p in sharpen(setup, best, some, effort):
+        for p in quick_fits(setup, best, some, effort):
             if some is richer or not sets or best.error > setup.quiet or p.gain > CHANCE:
                 sets.setdefault(key_of(setup, p.terms), p)
         for key, proposal in list(sets.items())[:count]:
             if key in found and some is others:
                 continue
-            fitted = entry(setup, fit(setup.problem, proposal.terms, proposal.start, setup.fitted, effort.last))
+            fitted = judge_fit(setup, fit(setup.problem, proposal.terms, proposal.start, setup.fitted, effort.last))
             if key not in found or fitted.error < found[key].error:
                 new[key] = fitted
     return new
 
 
 def exchange(
-    setup: Setup[Any], best: Entry, found: dict[frozenset[str], Entry], terms: Sequence[Term], effort: Effort
-) -> dict[frozenset[str], Entry]:
+    setup: Setup[Any], best: Hypothesis, found: dict[frozenset[str], Hypothesis], terms: Sequence[Term], effort: Effort
+) -> dict[frozenset[str], Hypothesis]:
     """What becomes of a set that leaves much when one effect makes way for any other, or starts elsewhere.
 
     The search came to it one effect at a time: the first of two may be one that stands in for both.
     """
-    new: dict[frozenset[str], Entry] = {}
+    new: dict[frozenset[str], Hypothesis] = {}
     nominal = len(setup.baseline.terms)
     for i in range(nominal, nominal + best.effects):
         less, start = _without(best.fit.terms, i), _without(best.fit.values, i)
-        parent = found.get(key_of(setup, less)) or entry(setup, fit(setup.problem, less, start, setup.fitted))
+        parent = found.get(key_of(setup, less)) or judge_fit(setup, fit(setup.problem, less, start, setup.fitted))
         others = {key: e for key, e in (found | new).items() if key != best.key}
-        ranked, _ = screen(setup, parent, proposals(parent, terms, best.effects, NEXT), effort.screen)
+        ranked, _ = screen(setup, parent, proposals(parent, terms, best.effects, NEXT), effort.screen_windows)
         new |= promising(setup, parent, ranked, effort.exchange, others, effort)
     return {key: e for key, e in new.items() if key not in found or e.error < found[key].error}
 
@@ -153,7 +153,9 @@ def _without(xs: Sequence[T], i: int) -> list[T]:
     return [*xs[:i], *xs[i + 1 :]]
 
 
-def no_worse(setup: Setup[Any], e: Entry, found: Mapping[frozenset[str], Entry], effort: Effort) -> Entry:
+def no_worse(
+    setup: Setup[Any], e: Hypothesis, found: Mapping[frozenset[str], Hypothesis], effort: Effort
+) -> Hypothesis:
     """A set as it was fitted, or fitted anew from the optimum of the best set within it, if that fits better."""
     scale = typical(setup.baseline.r)
     within = min((s for s in found.values() if s.key < e.key), key=lambda s: robust(s.fit.r, scale))
@@ -161,48 +163,48 @@ def no_worse(setup: Setup[Any], e: Entry, found: Mapping[frozenset[str], Entry],
         return e
     there = {(t.label, t.names): v for t, v in zip(within.fit.terms, within.fit.values, strict=True)}
     start = [there.get((t.label, t.names), np.clip(t.neutral, t.low, t.high)) for t in e.fit.terms]
-    return entry(setup, fit(setup.problem, e.fit.terms, start, setup.fitted, effort.last))
+    return judge_fit(setup, fit(setup.problem, e.fit.terms, start, setup.fitted, effort.last))
 
 
-def nearest(entries: Sequence[Entry]) -> Entry:
+def nearest(hypotheses: Sequence[Hypothesis]) -> Hypothesis:
     """The set that comes nearest to the fitted data, if that is worth a name; else the baseline.
 
     Args:
-        entries: As from `search`, baseline first.
+        hypotheses: As from `search`, baseline first.
     """
-    best = min(entries, key=lambda e: float(e.fitted.mean()))
-    before = float(entries[0].fitted.mean())
-    return best if before - float(best.fitted.mean()) > judge.worth(before) else entries[0]
+    best = min(hypotheses, key=lambda e: float(e.fitted.mean()))
+    before = float(hypotheses[0].fitted.mean())
+    return best if before - float(best.fitted.mean()) > judge.least_gain(before) else hypotheses[0]
 
 
-def again(setup: Setup[Any], entries: Sequence[Entry], best: Entry) -> list[Entry]:
+def refit(setup: Setup[Any], hypotheses: Sequence[Hypothesis], best: Hypothesis) -> list[Hypothesis]:
     """The best sets, those that are in them, and the baseline, fitted and judged anew for another setup.
 
     Args:
         setup: Of the same data.
-        entries: As from `search`, baseline first.
+        hypotheses: As from `search`, baseline first.
         best: One of them.
     """
-    rivals = sorted((e for e in entries[1:] if e.effects <= best.effects), key=lambda e: e.error)[:REJUDGED]
-    larger = sorted((e for e in entries[1:] if e.effects > best.effects), key=lambda e: e.error)[: REJUDGED // 3]
-    parts = [e for e in entries[1:] if e.key < best.key]
+    rivals = sorted((e for e in hypotheses[1:] if e.effects <= best.effects), key=lambda e: e.error)[:REJUDGED]
+    larger = sorted((e for e in hypotheses[1:] if e.effects > best.effects), key=lambda e: e.error)[: REJUDGED // 3]
+    parts = [e for e in hypotheses[1:] if e.key < best.key]
     enough = best.error + np.log(HOPELESS)
     rivals = [e for i, e in enumerate(rivals) if i < REJUDGED // 2 or e.error < enough]
     kept = {e.key: e for e in [best, *rivals, *parts, *larger]}
     fits = (fit(setup.problem, e.fit.terms, e.fit.values, setup.fitted) for e in kept.values())
-    return [entry(setup, setup.baseline), *(entry(setup, f) for f in fits)]
+    return [judge_fit(setup, setup.baseline), *(judge_fit(setup, f) for f in fits)]
 
 
 def swaps(
-    setup: Setup[Any], found: dict[frozenset[str], Entry], terms: Sequence[Term], effort: Effort
-) -> dict[frozenset[str], Entry]:
+    setup: Setup[Any], found: dict[frozenset[str], Hypothesis], terms: Sequence[Term], effort: Effort
+) -> dict[frozenset[str], Hypothesis]:
     """The best sets with one effect exchanged: for a simpler one that it holds, one that does much the same with the
     same number, for the usual name of the same term.
 
     Rivals this near must not lose because their fit began elsewhere, or never began.
     """
-    out: dict[frozenset[str], Entry] = {}
-    pick, scale = spread(setup.fitted, effort.sharpen), typical(setup.baseline.r)
+    out: dict[frozenset[str], Hypothesis] = {}
+    pick, scale = spread(setup.fitted, effort.quick_windows), typical(setup.baseline.r)
     for e in sorted(found.values(), key=lambda e: e.error)[:SWAPPED]:
         enough = HOPELESS * robust(e.fit.r[np.searchsorted(setup.fitted, pick)], scale)
         first, there = len(e.fit.terms) - e.effects, {t.label for t in e.terms}
@@ -214,7 +216,7 @@ def swaps(
                     quick = fit(setup.problem, changed, values, pick, effort.quick)
                     if robust(quick.r, scale) > enough:
                         continue
-                    other = entry(setup, fit(setup.problem, changed, quick.values, setup.fitted, effort.last))
+                    other = judge_fit(setup, fit(setup.problem, changed, quick.values, setup.fitted, effort.last))
                     before = out.get(other.key, found.get(other.key))
                     if before is None or other.error < before.error:
                         out[other.key] = other

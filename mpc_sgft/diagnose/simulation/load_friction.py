@@ -13,7 +13,7 @@ from mpc_sgft.diagnose.data.measured import Array
 from mpc_sgft.diagnose.simulation.plant import FORCE, Change, Plant, joint_of
 
 
-class Drive(NamedTuple):
+class JointActuator(NamedTuple):
     """An actuator at a joint: what its force becomes when its command changes at once.
 
     Attributes:
@@ -32,7 +32,7 @@ class Drive(NamedTuple):
     command: tuple[float, float]
 
     @classmethod
-    def of(cls, m: mujoco.MjModel, name: str, joint: int) -> Drive:
+    def of(cls, m: mujoco.MjModel, name: str, joint: int) -> JointActuator:
         a = m.actuator(name)
         force = _limits(m.actuator_forcelimited[a.id], m.actuator_forcerange[a.id])
         command = _limits(m.actuator_ctrllimited[a.id], m.actuator_ctrlrange[a.id])
@@ -55,7 +55,7 @@ def _limits(limited: int, given: Array) -> tuple[float, float]:
     return (float(given[0]), float(given[1])) if limited else (-np.inf, np.inf)
 
 
-def rub(
+def roll_with_load_friction(
     plant: Plant,
     models: list[mujoco.MjModel],
     changes: list[Change],
@@ -81,7 +81,7 @@ def rub(
     _, vadr = plant.addresses(m)
     losses = [x.dof_frictionloss for x in own]
     before, still = np.array(losses)[:, vadr], np.zeros((len(own), len(vadr)))
-    drives = [Drive.of(m, a, plant.joints.index(j)) for a in plant.actuators if (j := joint_of(plant, a))]
+    drives = [JointActuator.of(m, a, plant.joints.index(j)) for a in plant.actuators if (j := joint_of(plant, a))]
     states = np.empty((len(own), count, state.shape[1]))
     sensed = np.empty((len(own), count, m.nsensordata))
 

@@ -6,7 +6,6 @@ import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -14,18 +13,11 @@ import numpy as np
 from envs.effects.passive import stiffen_dry_friction
 from mpc_sgft.command.errors import UserError
 from mpc_sgft.diagnose.data.measured import Array, Index
+from mpc_sgft.diagnose.data.units import Axis
 
 SHARP = 5e-4  # [s] longest step of a fit that is judged
 FORCE = "diagnose/force/"  # sensors that are added for the comparison
 SCALAR = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
-
-
-class Axis(NamedTuple):
-    """What a joint's readings can be: its limits [rad or m], infinite where the model has none, and its kind."""
-
-    low: float = -np.inf
-    high: float = np.inf
-    slide: bool = False
 
 
 @dataclass(frozen=True)

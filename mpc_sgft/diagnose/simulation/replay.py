@@ -23,7 +23,7 @@ from mpc_sgft.diagnose.data import windows
 from mpc_sgft.diagnose.data.held_commands import held_mean
 from mpc_sgft.diagnose.data.measured import Array, Episode, Index
 from mpc_sgft.diagnose.data.smooth import smooth
-from mpc_sgft.diagnose.simulation.load_friction import Drive, rub
+from mpc_sgft.diagnose.simulation.load_friction import JointActuator, roll_with_load_friction
 from mpc_sgft.diagnose.simulation.plant import Change, Plant
 
 FULL = mujoco.mjtState.mjSTATE_FULLPHYSICS
@@ -88,7 +88,7 @@ class Replayer:
         pick = np.arange(len(w.start), dtype=np.int_) if pick is None else pick
         models = [self._centred(self.plant.compile(c)) for c in changes]
         out = np.empty((len(changes), len(pick), w.samples, len(self.signals)))
-        for group in _alike(models, changes):
+        for group in _same_layout(models, changes):
             out[group] = self._roll(
                 [models[k] for k in group],
                 [changes[k] for k in group],
@@ -114,7 +114,7 @@ class Replayer:
             inertia -= less
         return out
 
-    def of(self, plant: Plant) -> Replayer:
+    def with_plant(self, plant: Plant) -> Replayer:
         """The same windows of another model of the scene."""
         other = copy.copy(self)
         other.plant, other._nominal_ctrl = plant, None
@@ -127,14 +127,14 @@ class Replayer:
         other._nominal_ctrl = None
         return other
 
-    def led(self) -> Replayer:
+    def lead_up(self) -> Replayer:
         """Windows that end, or come by, where these begin; as early as smoothing lets them, at most by LEAD."""
         other, w, n = copy.copy(self), self.windows, int(self.ahead.max())
         other.windows = windows.at(self.episodes, self.smooth, self.signals, w.episode, w.start - self.ahead, n)
         other.ahead, other._nominal_ctrl = np.zeros_like(self.ahead), None
         return other
 
-    def read(self, acting: tuple[float, float]) -> Replayer:
+    def with_forces_read(self, acting: tuple[float, float]) -> Replayer:
         """The same windows with all forces read BEFORE or AFTER a sample's command is there."""
         other = copy.copy(self)
         other.windows = self.windows._replace(acting=np.broadcast_to(acting, self.windows.acting.shape))
@@ -161,7 +161,7 @@ class Replayer:
             for first, adr in ((1, qadr), (1 + m.nq, vadr))
         )
         late = np.array([[c.late.get(joint, 0.0) for joint in self.plant.joints] for c in changes])
-        felt = self._felt(models, changes, pick, sensed, inputs)
+        felt = self._force_readings(models, changes, pick, sensed, inputs)
         out = self._read(qpos, qvel, sensed, felt, m, late, a)
         for k, change in enumerate(changes if any(c.reads for c in changes) else []):
             for i, name in enumerate(self.signals):
@@ -200,14 +200,14 @@ class Replayer:
             bend_bristles(model, qvel, act)
         rotors = [j for j in map(m.joint, range(m.njnt)) if j.name.startswith(ROTOR)]
         if self.ahead.any() and (rotors or bristles(m)):
-            self._lead(models, changes, pick, state, rotors)
+            self._settle_memories(models, changes, pick, state, rotors)
         return state, a
 
-    def _lead(
+    def _settle_memories(
         self, models: list[mujoco.MjModel], changes: list[Change], pick: Index, state: Array, rotors: list[Any]
     ) -> None:
         """Put rotors and bristles where they come to stand on the way to the windows' starts; in place."""
-        m, before = models[0], self.led()
+        m, before = models[0], self.lead_up()
         start, _ = before._begin(models, changes, pick, None)
         _, states, _ = before._advance(models, changes, pick, start, None)
         way = np.concatenate([start[:, :, None], states], 2)
@@ -238,7 +238,7 @@ class Replayer:
         inputs = np.zeros((len(models), count, self.steps, m.nu + (m.nv if force is not None else 0)))
         order = [m.actuator(a).id for a in self.plant.actuators] if extra else list(range(nu))
         for k, change in enumerate(changes):
-            inputs[k, :, :, order] = np.moveaxis(self._ctrl(change, pick), -1, 0)
+            inputs[k, :, :, order] = np.moveaxis(self._step_commands(change, pick), -1, 0)
         if force is not None:
             inputs[..., m.nu + vadr] = force
         for column, name in zip(order, self.plant.actuators, strict=True):
@@ -252,7 +252,9 @@ class Replayer:
 
         def go(driven: Array) -> tuple[Array, Array]:
             if changes[0].frictions:
-                return rub(self.plant, models, changes, starts, driven, control, round(self.dt / self.h))
+                return roll_with_load_friction(
+                    self.plant, models, changes, starts, driven, control, round(self.dt / self.h)
+                )
             states, sensed = mujoco.rollout.rollout(each, workers, starts, driven, control_spec=control)
             return np.asarray(states, float), np.asarray(sensed, float)
 
@@ -273,7 +275,7 @@ class Replayer:
                 out[row, mine] = np.interp(at, np.arange(len(values)), values[:, joint])
         return out
 
-    def _felt(
+    def _force_readings(
         self, models: list[mujoco.MjModel], changes: list[Change], pick: Index, sensed: Array, inputs: Array
     ) -> dict[str, Array]:
         """Compared force signals -> what they read at the samples, [K, W, n].
@@ -289,11 +291,11 @@ class Replayer:
             return {}
         w, at = self.windows, self.dt * np.arange(1, self.windows.samples + 1)[None] / self.h
         ticks = self.dt * (w.start[pick, None] + np.arange(1, w.samples + 1))[..., None]
-        now = np.stack([self._held(c, pick, ticks + w.acting[pick]) for c in changes])  # [K, W, n, nu]
+        now = np.stack([self._mean_commands(c, pick, ticks + w.acting[pick]) for c in changes])  # [K, W, n, nu]
         out = {}
         for name in names:
             part = name.split("/", 1)[1]
-            drives = [Drive.of(m, part, 0) for m in models]
+            drives = [JointActuator.of(m, part, 0) for m in models]
             felt, then = _at(sensed[..., drives[0].sensor], at), _at(inputs[..., drives[0].ctrl], at)
             u = now[..., self.plant.actuators.index(part)]
             out[name] = np.stack([d.load(*rows) for d, *rows in zip(drives, felt, then, u, strict=True)])
@@ -338,20 +340,20 @@ class Replayer:
                 columns.append(_at(sensed[..., int(m.sensor(part).adr[0])], times / self.h))
         return np.stack(columns, -1)
 
-    def _ctrl(self, change: Change, pick: Index) -> Array:
+    def _step_commands(self, change: Change, pick: Index) -> Array:
         """Mean command of each physics step of the picked windows, [W, N, nu]."""
         plain = not change.commands and not np.any(change.delay) and not np.any(change.lag)
         if plain and self._nominal_ctrl is not None:
             return self._nominal_ctrl[pick]
         every = np.arange(len(self.windows.start), dtype=np.int_) if plain else pick
         edges = self.step_times()[every][:, :, None] + np.array([-self.half, self.h - self.half])
-        out = self._held(change, every, edges)
+        out = self._mean_commands(change, every, edges)
         if plain:
             self._nominal_ctrl = out
             return out[pick]
         return out
 
-    def _held(self, change: Change, pick: Index, edges: Array) -> Array:
+    def _mean_commands(self, change: Change, pick: Index, edges: Array) -> Array:
         """Mean commands of the picked windows over intervals of time since their episode's start, [W, N, 2 -> nu]."""
         size = len(self.plant.actuators)
         late, lag = (np.broadcast_to(np.asarray(x, float), (size,)) for x in (change.delay, change.lag))
@@ -368,7 +370,7 @@ class Replayer:
         return out
 
 
-def _alike(models: Sequence[mujoco.MjModel], changes: Sequence[Change]) -> list[list[int]]:
+def _same_layout(models: Sequence[mujoco.MjModel], changes: Sequence[Change]) -> list[list[int]]:
     """Indices of models of the same layout, all with loaded friction or none: these can be rolled out in one call.
 
     One whose arrays are larger than those of the first would be written beyond the end of its data.

@@ -9,7 +9,7 @@ import numpy as np
 
 from mpc_sgft.diagnose.data.measured import Array
 from mpc_sgft.diagnose.fitting.fit import change_of
-from mpc_sgft.diagnose.fitting.hypothesis import Entry
+from mpc_sgft.diagnose.fitting.hypothesis import Hypothesis
 from mpc_sgft.diagnose.fitting.prepare import Setup
 from mpc_sgft.diagnose.simulation.plant import Change
 
@@ -18,16 +18,16 @@ LOAD = 0.5  # of the body's mass
 CLEAR = 3.0  # times the noise: a separation below is not worth an experiment
 
 
-def _time(ctrl: Array, speed: float) -> Array:
+def _at_speed(ctrl: Array, speed: float) -> Array:
     """The same commands faster or slower, from the start of the recording, repeated where they end."""
     n = len(ctrl)
     return ctrl[np.round(np.arange(n) * speed).astype(int) % n]
 
 
-def _commands() -> dict[str, Callable[[Array], Array]]:
+def _command_changes() -> dict[str, Callable[[Array], Array]]:
     return {
-        "slower motion: the same commands in twice the time": lambda u: _time(u, 0.5),
-        "faster motion: the same commands in half the time": lambda u: _time(u, 2.0),
+        "slower motion: the same commands in twice the time": lambda u: _at_speed(u, 0.5),
+        "faster motion: the same commands in half the time": lambda u: _at_speed(u, 2.0),
         "larger motion: commands 1.5 times as large": lambda u: u.mean(0) + 1.5 * (u - u.mean(0)),
         "reversals: the same commands mirrored, so that every motion is also made backwards": lambda u: (
             2 * u.mean(0) - u
@@ -36,13 +36,13 @@ def _commands() -> dict[str, Callable[[Array], Array]]:
     }
 
 
-def next_experiment(setup: Setup, tied: Sequence[Entry]) -> str:
+def next_experiment(setup: Setup, tied: Sequence[Hypothesis]) -> str:
     """Words for the proposal that separates the tied candidates best, and by how many times the noise."""
     problem = setup.problem
     pick = setup.fitted[np.unique(np.linspace(0, len(setup.fitted) - 1, WINDOWS).astype(int))]
     changes = [change_of(e.fit.terms, e.fit.values) for e in tied[:4]]
     outcomes: dict[str, float] = {}
-    for words, change in _commands().items():
+    for words, change in _command_changes().items():
         replayer = problem.replayer.with_commands(change)
         outcomes[words] = separation(problem.whiten(replayer.simulate(changes, pick), pick))
     for body in problem.replayer.plant.bodies:

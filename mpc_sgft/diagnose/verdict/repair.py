@@ -9,11 +9,11 @@ import mujoco
 from envs.effects.base import Effect, load
 from mpc_sgft.diagnose.candidates.library import as_gap, settings
 from mpc_sgft.diagnose.candidates.nominal import scale
-from mpc_sgft.diagnose.fitting.hypothesis import Entry
+from mpc_sgft.diagnose.fitting.hypothesis import Hypothesis
 from mpc_sgft.diagnose.simulation.plant import FORCE, Plant
 
 
-def repaired_spec(plant: Plant, best: Entry) -> tuple[mujoco.MjSpec, list[str]]:
+def repaired_spec(plant: Plant, best: Hypothesis) -> tuple[mujoco.MjSpec, list[str]]:
     """The scene with refitted quantities and effects in it, and what MJCF cannot carry, in words."""
     spec, notes = plant.spec.copy(), []
     for term, value in zip(best.fit.terms, best.fit.values, strict=True):
@@ -31,7 +31,7 @@ def repaired_spec(plant: Plant, best: Entry) -> tuple[mujoco.MjSpec, list[str]]:
     return spec, notes
 
 
-def write(plant: Plant, best: Entry, out: Path) -> list[str]:
+def write(plant: Plant, best: Hypothesis, out: Path) -> list[str]:
     """Write repaired.xml and effects.yaml; returns notes.
 
     Raises:

@@ -10,9 +10,10 @@ import pytest
 
 from mpc_sgft.command.errors import UserError
 from mpc_sgft.diagnose.__main__ import main
-from mpc_sgft.diagnose.check import episodes
+from mpc_sgft.diagnose.data.check import episodes
 from mpc_sgft.diagnose.data.measured import Table, files, read_table, write_csv
-from mpc_sgft.diagnose.simulation.plant import Axis, load_plant
+from mpc_sgft.diagnose.data.units import Axis
+from mpc_sgft.diagnose.simulation.plant import load_plant
 
 CHIRP = np.sin(1e-3 * np.arange(209) ** 2)
 RANGES = {"x": Axis(-2.0, 2.0, slide=True)}

@@ -14,7 +14,7 @@ from envs.effects import load
 from mpc_sgft.command.errors import UserError
 from mpc_sgft.diagnose.__main__ import main
 from mpc_sgft.diagnose.deployed import diagnose_run
-from mpc_sgft.diagnose.deployments.command_link import Commands, measured_drive
+from mpc_sgft.diagnose.deployments.command_link import ServoCommands, measured_drive
 from mpc_sgft.diagnose.deployments.recordings import read_deployment
 from mpc_sgft.storage.episode_file import read_episode
 
@@ -60,7 +60,7 @@ def test_force_tells_what_reached_the_servos_and_the_recording_does_not(deployed
     run = deployed(gap, episodes=1)
     deployment = read_deployment(run)
     (episode,), task = deployment.episodes, deployment.task
-    meant, true = Commands(task, [episode]).drive([(), tuple(load(gap))])[:, 0, 1::2]  # [S, nu], as sampled
+    meant, true = ServoCommands(task, [episode]).drive([(), tuple(load(gap))])[:, 0, 1::2]  # [S, nu], as sampled
     drive = measured_drive(task.spec().compile(), episode)
     assert np.sqrt(np.mean((drive - true) ** 2)) < 1e-3 < 0.05 < np.sqrt(np.mean((drive - meant) ** 2))
     recorded = read_episode(run / "episodes" / "0001.mcap").joints["ctrl"]

@@ -12,8 +12,8 @@ from mpc_sgft.diagnose.candidates.library import make_term
 from mpc_sgft.diagnose.candidates.nominal import nominal_terms
 from mpc_sgft.diagnose.fitting import judge
 from mpc_sgft.diagnose.fitting.fit import change_of, fit
-from mpc_sgft.diagnose.fitting.hypothesis import Entry, entry
-from mpc_sgft.diagnose.fitting.prepare import Setup, prepare, scales
+from mpc_sgft.diagnose.fitting.hypothesis import Hypothesis, judge_fit
+from mpc_sgft.diagnose.fitting.prepare import Setup, prepare, typical_sizes
 from mpc_sgft.diagnose.simulation.plant import Plant
 from tools.studies import emps
 
@@ -25,12 +25,12 @@ def _problem(data_dir: Path) -> tuple[Plant, Setup]:
     return plant, prepare(plant, emps.thirds(data_dir), nominal, window=0.5, signals=None, held_out=held_out)
 
 
-def _fitted(plant: Plant, setup: Setup, *places: tuple[str, str, str]) -> Entry:
+def _fitted(plant: Plant, setup: Setup, *places: tuple[str, str, str]) -> Hypothesis:
     """Fit of the mass and of effects, each by name, kind of place and place."""
-    at = scales(plant, setup.problem.replayer)
+    at = typical_sizes(plant, setup.problem.replayer)
     terms = [make_term(plant, name, place, at[kind, place]) for name, kind, place in places]
     start = [*setup.baseline.values, *(t.starts[0] for t in terms)]
-    return entry(setup, fit(setup.problem, [*setup.baseline.terms, *terms], start, setup.fitted))
+    return judge_fit(setup, fit(setup.problem, [*setup.baseline.terms, *terms], start, setup.fitted))
 
 
 def test_asymmetric_viscous_and_coulomb_friction_predict_both_held_out_recordings(data_dir: Path) -> None:

@@ -9,18 +9,18 @@ import mujoco
 import numpy as np
 import pytest
 
-from mpc_sgft.diagnose.candidates.effect_table import Scales
+from mpc_sgft.diagnose.candidates.effect_table import TypicalSizes
 from mpc_sgft.diagnose.candidates.library import Term, as_gap, candidates, settings, simplify
-from mpc_sgft.diagnose.fitting import screen as screening
+from mpc_sgft.diagnose.fitting import screening as screening
 from mpc_sgft.diagnose.fitting import search as searching
 from mpc_sgft.diagnose.fitting.fit import Fit, fit
-from mpc_sgft.diagnose.fitting.flexible import Flexible
-from mpc_sgft.diagnose.fitting.hypothesis import Entry, entry
+from mpc_sgft.diagnose.fitting.hypothesis import Hypothesis, judge_fit
 from mpc_sgft.diagnose.fitting.prepare import NOISE, Setup
-from mpc_sgft.diagnose.fitting.screen import Effort
+from mpc_sgft.diagnose.fitting.residual_model import ResidualModel
+from mpc_sgft.diagnose.fitting.screening import Effort
 from mpc_sgft.diagnose.fitting.search import no_worse, search, swaps
 from mpc_sgft.diagnose.simulation.plant import Change, Plant
-from mpc_sgft.diagnose.verdict.naming import caution, gains, holds, judge_entries
+from mpc_sgft.diagnose.verdict.naming import caution, gains, holds, reach_verdict
 
 Points = Sequence[Sequence[np.ndarray]]
 PENDULUM = """<mujoco><worldbody><body><joint name="hinge" axis="0 1 0"/><geom size="0.05" pos="0 0 -0.4" mass="1"/>
@@ -59,8 +59,8 @@ def found(pairs: int) -> list[set[str]]:
     setup = Setup(problem, fitted, np.arange(18, 24), fitted // 3, base, none, none, np.log1p, NOISE)
     terms = [term(name) for name in "abcdefghxy"]
     effort = Effort(beam=(1,), full=(1, 1, 1), pairs=pairs)
-    _, entries = search(setup, terms, 2, np.random.default_rng(0), effort=effort)
-    return [set(e.names) for e in entries if e.error < NOISE + 0.1]
+    _, hypotheses = search(setup, terms, 2, np.random.default_rng(0), effort=effort)
+    return [set(e.names) for e in hypotheses if e.error < NOISE + 0.1]
 
 
 def test_two_effects_that_nearly_cancel_are_found_together() -> None:
@@ -73,9 +73,9 @@ def test_a_small_second_effect_is_found_where_the_first_leaves_less_than_the_noi
     problem.y = 3 * c["a"] + 0.4 * c["b"] + 0.8 * np.random.default_rng(3).normal(size=problem.y.shape)
     base, rng = fit(problem, [], [], fitted), np.random.default_rng(0)
     setup = Setup(problem, fitted, np.arange(18, 24), fitted // 3, base, none, none, np.log1p, NOISE)
-    _, entries = search(setup, [term(name) for name in "abcdefgh"], 2, rng)
-    assert next(e.error for e in entries if e.names == ["a"]) < setup.quiet
-    verdict = judge_entries(setup, entries, None, rng)
+    _, hypotheses = search(setup, [term(name) for name in "abcdefgh"], 2, rng)
+    assert next(e.error for e in hypotheses if e.names == ["a"]) < setup.quiet
+    verdict = reach_verdict(setup, hypotheses, None, rng)
     assert (verdict.kind, sorted(verdict.best.names)) == ("effect", ["a", "b"])
     assert max(e.effects for e in search(setup, [term(x) for x in "abcdefgh"], 3, rng)[1]) == 2  # nor a third
 
@@ -99,14 +99,14 @@ def test_further_effects_are_sought_in_the_problem_as_the_first_sees_it() -> Non
 
     terms = [term(name) for name in "bcdefgh"]
     assert searched(setups[0], terms, rng) == [["b", "c"]]
-    setup, entries = search(setups[0], terms, 2, rng, nearer=nearer)
-    assert setup is setups[1] and asked == [["b"]] and not entries[0].effects
-    assert judge_entries(setup, entries, None, rng).best.names == ["b"]
+    setup, hypotheses = search(setups[0], terms, 2, rng, nearer=nearer)
+    assert setup is setups[1] and asked == [["b"]] and not hypotheses[0].effects
+    assert reach_verdict(setup, hypotheses, None, rng).best.names == ["b"]
 
 
 def searched(setup: Setup[Lines], terms: Sequence[Term], rng: np.random.Generator) -> list[list[str]]:
-    setup, entries = search(setup, terms, 2, rng)
-    return [sorted(judge_entries(setup, entries, None, rng).best.names)]
+    setup, hypotheses = search(setup, terms, 2, rng)
+    return [sorted(reach_verdict(setup, hypotheses, None, rng).best.names)]
 
 
 def test_what_gains_no_more_than_chance_gets_no_full_fit_where_noise_alone_is_left() -> None:
@@ -115,8 +115,8 @@ def test_what_gains_no_more_than_chance_gets_no_full_fit_where_noise_alone_is_le
     base = fit(problem, [], [], fitted)
     for quiet, counts in ((NOISE + 0.05, (1, 2)), (0.0, (5,))):
         setup = Setup(problem, fitted, np.arange(18, 24), fitted // 3, base, none, none, np.log1p, quiet)
-        _, entries = search(setup, [term(name) for name in "bcdefgh"], 1, np.random.default_rng(0))
-        assert sum(e.effects for e in entries) in counts
+        _, hypotheses = search(setup, [term(name) for name in "bcdefgh"], 1, np.random.default_rng(0))
+        assert sum(e.effects for e in hypotheses) in counts
 
 
 @pytest.mark.parametrize("exchange", [0, 2])
@@ -129,8 +129,8 @@ def test_an_effect_that_stood_in_for_two_makes_way_for_them(exchange: int) -> No
     setup = Setup(problem, fitted, np.arange(18, 24), fitted // 3, base, none, none, np.log1p, NOISE)
     terms = [term(name) for name in "abcefgh"]
     effort = Effort(beam=(1,), full=(1, 1, 1), pairs=0, exchange=exchange)
-    _, entries = search(setup, terms, 2, np.random.default_rng(0), effort=effort)
-    assert [set(e.names) for e in entries if e.error < NOISE + 0.1] == [{"b", "c"}] * bool(exchange)
+    _, hypotheses = search(setup, terms, 2, np.random.default_rng(0), effort=effort)
+    assert [set(e.names) for e in hypotheses if e.error < NOISE + 0.1] == [{"b", "c"}] * bool(exchange)
 
 
 def test_a_delay_is_exchanged_for_a_lag_but_not_where_there_is_one() -> None:
@@ -138,7 +138,7 @@ def test_a_delay_is_exchanged_for_a_lag_but_not_where_there_is_one() -> None:
     terms = [term("actuator_delay"), term("actuator_lag")]
     problem.columns |= {"actuator_delay": problem.columns["x"], "actuator_lag": problem.columns["y"]}
     setup = Setup(problem, fitted, np.arange(18, 24), fitted // 3, fit(problem, [], [], fitted), none, none, np.log1p)
-    alone, both = (entry(setup, fit(problem, t, [none] * len(t), fitted)) for t in (terms[:1], terms))
+    alone, both = (judge_fit(setup, fit(problem, t, [none] * len(t), fitted)) for t in (terms[:1], terms))
     assert [e.names for e in swaps(setup, {alone.key: alone}, terms, Effort()).values()] == [["actuator_lag"]]
     assert not swaps(setup, {both.key: both}, terms, Effort())
 
@@ -156,7 +156,7 @@ def test_a_simpler_effect_and_the_usual_name_of_a_term_are_tried_in_place_of_wha
     simple = replace(terms[0], names=("coefficient",))
     assert simplify(rich, np.array([2.0, 4.0]), simple).tolist() == [3.0]
     setup = Setup(problem, fitted, np.arange(18, 24), fitted // 3, fit(problem, [], [], fitted), none, none, np.log1p)
-    start = entry(setup, fit(problem, [rich, terms[2]], [both, none], fitted, 0))
+    start = judge_fit(setup, fit(problem, [rich, terms[2]], [both, none], fitted, 0))
     found = swaps(setup, {start.key: start}, [simple, *terms[1:]], Effort()).values()
     names = [e.names for e in found]
     assert names == [["viscous_friction", "gravity_tilt"], ["asymmetric_friction", "actuator_offset"]]
@@ -176,7 +176,7 @@ def test_where_noise_alone_is_left_one_more_effect_must_gain_more_than_the_only_
         none,
         quiet=NOISE + 0.1,
     )
-    base, rng = entry(setup, setup.baseline), np.random.default_rng(0)
+    base, rng = judge_fit(setup, setup.baseline), np.random.default_rng(0)
     scatter = np.abs(0.01 * rng.normal(size=24))
 
     def better(before: float, gain: float, effects: int = 0) -> bool:
@@ -191,7 +191,7 @@ def test_where_noise_alone_is_left_one_more_effect_must_gain_more_than_the_only_
 def test_a_richer_effect_in_place_of_what_it_includes_need_gain_less_than_a_further_one() -> None:
     problem, fitted, none = Lines(), np.arange(18), np.zeros(1)
     setup = Setup(problem, fitted, np.arange(18, 24), fitted // 3, fit(problem, [], [], fitted), none, none)
-    base, rng = entry(setup, setup.baseline)._replace(effects=1), np.random.default_rng(0)
+    base, rng = judge_fit(setup, setup.baseline)._replace(effects=1), np.random.default_rng(0)
     scatter = np.abs(0.01 * rng.normal(size=24))
 
     def better(name: str, gain: float) -> bool:
@@ -213,8 +213,8 @@ def test_a_tie_that_needs_another_mass_loses_against_one_that_finds_it_as_given(
     nominal = replace(term("nominal"), neutral=one, low=0.7 * one, high=1.3 * one, size=0.15 * one)
     base = fit(problem, [nominal], [one], fitted)
     setup = Setup(problem, fitted, np.arange(18, 24), fitted // 3, base, none, none, np.log1p)
-    named = [entry(setup, fit(problem, [nominal, term(x)], [one, one], fitted)) for x in "ba"]
-    verdict = judge_entries(setup, [entry(setup, base), *named], None, np.random.default_rng(0))
+    named = [judge_fit(setup, fit(problem, [nominal, term(x)], [one, one], fitted)) for x in "ba"]
+    verdict = reach_verdict(setup, [judge_fit(setup, base), *named], None, np.random.default_rng(0))
     assert verdict.kind == kind and sorted({*verdict.best.names, *(n for e, _ in verdict.ties for n in e.names)}) == (
         ["a"] if kind == "effect" else ["a", "b"]
     )
@@ -227,9 +227,9 @@ def test_names_that_leave_much_of_an_error_are_no_answer(before: float, after: f
     problem, fitted, none = Lines(), np.arange(18), np.zeros(1)
     setup = Setup(problem, fitted, np.arange(18, 24), fitted // 3, fit(problem, [], [], fitted), none, none)
     scatter = 0.01 * np.random.default_rng(0).normal(size=24)
-    base = entry(setup, setup.baseline)._replace(errors=np.log1p(before) + scatter)
-    named = entry(setup, fit(problem, [term("a")], [np.ones(1)], fitted))._replace(errors=np.log1p(after) + scatter)
-    verdict = judge_entries(setup, [base, named], None, np.random.default_rng(0))
+    base = judge_fit(setup, setup.baseline)._replace(errors=np.log1p(before) + scatter)
+    named = judge_fit(setup, fit(problem, [term("a")], [np.ones(1)], fitted))._replace(errors=np.log1p(after) + scatter)
+    verdict = reach_verdict(setup, [base, named], None, np.random.default_rng(0))
     assert verdict.kind == kind
     assert [("hold a:" in note) for note in caution(verdict)] == [True] * (kind == "unknown")
 
@@ -249,16 +249,16 @@ def test_an_error_is_unknown_if_a_flexible_model_explains_it(
     problem, fitted, none = Lines(), np.arange(18), np.zeros(1)
     setup = Setup(problem, fitted, np.arange(18, 24), fitted // 3, fit(problem, [], [], fitted), none, none)
     errors = np.log1p(left) + 0.01 * np.random.default_rng(0).normal(size=24)
-    base = entry(setup, setup.baseline)._replace(errors=errors)
-    model = None if flexible is None else Flexible(errors + np.log1p(flexible) - np.log1p(left), np.zeros(1), 1.0)
-    verdict = judge_entries(setup, [base], model, np.random.default_rng(0))
+    base = judge_fit(setup, setup.baseline)._replace(errors=errors)
+    model = None if flexible is None else ResidualModel(errors + np.log1p(flexible) - np.log1p(left), np.zeros(1), 1.0)
+    verdict = reach_verdict(setup, [base], model, np.random.default_rng(0))
     assert verdict.kind == kind and words in verdict.reason
     assert not verdict.best.effects and not caution(verdict)
 
 
 def test_a_typical_size_is_no_larger_than_what_is_allowed() -> None:
     plant = Plant(mujoco.MjSpec.from_string(PENDULUM))
-    still = {("joint", "hinge"): Scales(force=1.0, speed=1e-6)}  # drag is counted in force / speed^2
+    still = {("joint", "hinge"): TypicalSizes(force=1.0, speed=1e-6)}  # drag is counted in force / speed^2
     (drag,) = candidates(plant, still, ["quadratic_drag"])
     assert drag.size[0] == drag.high[0] - drag.low[0] == 1e5
 
@@ -269,12 +269,12 @@ def test_a_set_never_fits_worse_than_one_within_it() -> None:
     base = fit(problem, [], [], fitted)
     setup = Setup(problem, fitted, np.arange(18, 24), fitted // 3, base, none, none, np.log1p)
     x, y = term("x"), term("y")
-    small = [entry(setup, fit(problem, [t], [np.ones(1)], fitted)) for t in (x, y)]
-    stuck = entry(setup, fit(problem, [y, x], [40 * np.ones(1)] * 2, fitted, 0))
-    found = {e.key: e for e in (entry(setup, base), *small)}
+    small = [judge_fit(setup, fit(problem, [t], [np.ones(1)], fitted)) for t in (x, y)]
+    stuck = judge_fit(setup, fit(problem, [y, x], [40 * np.ones(1)] * 2, fitted, 0))
+    found = {e.key: e for e in (judge_fit(setup, base), *small)}
     better = no_worse(setup, stuck, found, Effort())
 
-    def cost(e: Entry) -> float:
+    def cost(e: Hypothesis) -> float:
         return float((e.fit.r**2).sum())
 
     assert cost(stuck) > 10 * cost(small[0]) and cost(better) <= min(cost(e) for e in small)
@@ -283,7 +283,7 @@ def test_a_set_never_fits_worse_than_one_within_it() -> None:
 
 def test_gravity_may_turn_about_one_axis_or_both() -> None:
     plant = Plant(mujoco.MjSpec.from_string(PENDULUM))
-    tilts = candidates(plant, {("", ""): Scales()}, ["gravity_tilt"])
+    tilts = candidates(plant, {("", ""): TypicalSizes()}, ["gravity_tilt"])
     assert [t.names for t in tilts] == [("angle",), ("roll",), ("angle", "roll")]
     assert settings(tilts[0], np.array([0.1])) == {"angle": 0.1, "roll": 0.0}
 

@@ -12,12 +12,12 @@ import pytest
 from mpc_sgft.diagnose import diagnose
 from mpc_sgft.diagnose import run as running
 from mpc_sgft.diagnose.candidates.library import make_term
-from mpc_sgft.diagnose.check import episodes
+from mpc_sgft.diagnose.data.check import episodes
 from mpc_sgft.diagnose.data.measured import Episode, read_table
 from mpc_sgft.diagnose.fitting import search as searching
 from mpc_sgft.diagnose.fitting.fit import fit
-from mpc_sgft.diagnose.fitting.hypothesis import Entry, entry
-from mpc_sgft.diagnose.fitting.prepare import Problem, Setup, around, default_signals, prepare, scales
+from mpc_sgft.diagnose.fitting.hypothesis import Hypothesis, judge_fit
+from mpc_sgft.diagnose.fitting.prepare import Problem, Setup, default_signals, near_fit, prepare, typical_sizes
 from mpc_sgft.diagnose.simulation.plant import Plant, load_plant
 
 
@@ -30,15 +30,17 @@ def dry(slide: Path, record) -> tuple[Plant, Setup[Problem]]:
     return plant, prepare(plant, recorded, [], window=None, signals=None, held_out=None)
 
 
-def _fit(setup: Setup[Problem], plant: Plant, *sizes: tuple[str, float]) -> Entry:
-    terms = [make_term(plant, name, "x", scales(plant, setup.problem.replayer)["joint", "x"]) for name, _ in sizes]
-    return entry(setup, fit(setup.problem, terms, [np.array([x]) for _, x in sizes], setup.fitted))
+def _fit(setup: Setup[Problem], plant: Plant, *sizes: tuple[str, float]) -> Hypothesis:
+    terms = [
+        make_term(plant, name, "x", typical_sizes(plant, setup.problem.replayer)["joint", "x"]) for name, _ in sizes
+    ]
+    return judge_fit(setup, fit(setup.problem, terms, [np.array([x]) for _, x in sizes], setup.fitted))
 
 
 def test_near_the_right_fit_noise_alone_is_left(dry) -> None:
     plant, setup = dry
     far = _fit(setup, plant, ("coulomb_friction", 15.0))
-    near = _fit(around(setup, far.fit, plant), plant, ("coulomb_friction", 15.0))
+    near = _fit(near_fit(setup, far.fit, plant), plant, ("coulomb_friction", 15.0))
     squares = [float((e.fit.r**2).mean()) for e in (far, near)]
     assert 0.8 < squares[1] < 1.15 < 1.8 < squares[0], squares
 
@@ -48,7 +50,7 @@ def test_judging_again_keeps_the_parts_of_a_set_however_bad_they_are(dry, monkey
     plant, setup = dry
     singles = [_fit(setup, plant, (n, 0.1)) for n in ("coulomb_friction", "viscous_friction", "quadratic_drag")]
     pair = _fit(setup, plant, ("viscous_friction", 0.1), ("coulomb_friction", 15.0))
-    judged = searching.again(around(setup, pair.fit, plant), [entry(setup, setup.baseline), *singles, pair], pair)
+    judged = searching.refit(near_fit(setup, pair.fit, plant), [judge_fit(setup, setup.baseline), *singles, pair], pair)
     assert not judged[0].effects and {e.key for e in judged[1:]} == {pair.key, singles[0].key, singles[1].key}
 
 
@@ -56,7 +58,7 @@ def test_judging_again_keeps_the_parts_of_a_set_however_bad_they_are(dry, monkey
 def test_steps_are_as_long_as_noise_hides_their_error(
     noise: float, searched: float, judged: float, slide: Path, record, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    steps: dict[str, list[float]] = {"search": [], "judge_entries": []}
+    steps: dict[str, list[float]] = {"search": [], "reach_verdict": []}
 
     def watch(name: str) -> Callable[..., object]:
         inner = getattr(running, name)

@@ -10,8 +10,7 @@ from scipy.interpolate import CubicSpline
 
 from mpc_sgft.command.errors import UserError
 from mpc_sgft.diagnose.data.measured import MIN_SAMPLES, Array, Episode, Index, Table
-from mpc_sgft.diagnose.simulation.plant import Axis
-from mpc_sgft.diagnose.units import check_order, check_speeds, check_units
+from mpc_sgft.diagnose.data.units import Axis, check_order, check_speeds, check_units
 
 KINDS = ("qpos", "qvel", "force", "sensor")
 GAP = 3.5  # a pause longer than this many sample times starts a new episode

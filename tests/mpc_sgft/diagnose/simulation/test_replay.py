@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 
 from mpc_sgft.command.errors import UserError
-from mpc_sgft.diagnose.candidates.effect_table import TABLE, Scales
+from mpc_sgft.diagnose.candidates.effect_table import TABLE, TypicalSizes
 from mpc_sgft.diagnose.candidates.library import candidates, enrich, make_term
 from mpc_sgft.diagnose.data.held_commands import held_mean
 from mpc_sgft.diagnose.data.measured import Episode
 from mpc_sgft.diagnose.data.smooth import smooth
 from mpc_sgft.diagnose.data.windows import AFTER, BEFORE
-from mpc_sgft.diagnose.fitting.prepare import discrepancy, prepare, scales
-from mpc_sgft.diagnose.simulation.load_friction import Drive
+from mpc_sgft.diagnose.fitting.prepare import discrepancy, prepare, typical_sizes
+from mpc_sgft.diagnose.simulation.load_friction import JointActuator
 from mpc_sgft.diagnose.simulation.plant import Change, Plant
-from mpc_sgft.diagnose.simulation.replay import Replayer, _alike
+from mpc_sgft.diagnose.simulation.replay import Replayer, _same_layout
 
 SLIDE = """<mujoco><option timestep="0.002"/><worldbody><body name="cart"><joint name="x" type="slide" axis="1 0 0"/>
 <geom size="0.1" mass="2"/></body></worldbody><actuator><motor name="motor" joint="x"/></actuator></mujoco>"""
@@ -44,17 +44,17 @@ def test_a_right_model_predicts_to_the_second_order(plant) -> None:
 
 def test_a_model_that_the_data_contradict_is_simulated_to_the_second_order_too(plant) -> None:
     """Its acceleration at a start is not the measured one, and its damping is not that of the scene."""
-    change, off = make_term(plant, "viscous_friction", "x", Scales()).build(np.array([3.0])), []
+    change, off = make_term(plant, "viscous_friction", "x", TypicalSizes()).build(np.array([3.0])), []
     true = Replayer(plant.sharper(2e-5), [_sine()], 0.5, ["qpos/x"])
     for h in (2e-3, 1e-3):
-        coarse = true.of(plant.sharper(h))
+        coarse = true.with_plant(plant.sharper(h))
         off.append(float(np.abs(coarse.simulate([change]) - true.simulate([change])).max()))
     assert off[0] < 1e-6 and off[0] / off[1] > 2.5, off  # the first order makes 1.6e-4 m, and halves
 
 
 def test_damping_that_is_stiff_stays_stable(plant) -> None:
     """A time constant of half a millisecond at steps of two: the slide creeps with u / d."""
-    episode, stiff = _sine(), make_term(plant, "viscous_friction", "x", Scales()).build(np.array([4000.0]))
+    episode, stiff = _sine(), make_term(plant, "viscous_friction", "x", TypicalSizes()).build(np.array([4000.0]))
     still = replace(episode, signals={"qpos/x": 0 * episode.signals["qpos/x"]})
     replayer = Replayer(plant, [still], 0.5, ["qpos/x"])
     t = replayer.windows.start[:, None] * 0.001 + 0.001 * np.arange(501)
@@ -84,7 +84,7 @@ def test_held_mean_by_hand() -> None:
 def test_a_delay_reaches_back_before_the_window(plant) -> None:
     episode = _sine()
     replayer = Replayer(plant, [episode], 0.5, ["qpos/x"])
-    late = make_term(plant, "actuator_delay", "motor", Scales()).build(np.array([0.05]))
+    late = make_term(plant, "actuator_delay", "motor", TypicalSizes()).build(np.array([0.05]))
     moved = np.vstack([np.repeat(episode.ctrl[:1], 50, 0), episode.ctrl[:-50]])
     shifted = Replayer(plant, [Episode("late", 0.001, moved, episode.signals)], 0.5, ["qpos/x"])
     np.testing.assert_allclose(replayer.simulate([late]), shifted.simulate([Change()]), atol=1e-12)
@@ -94,7 +94,7 @@ def test_a_late_sensor_shows_what_was_true_before(plant) -> None:
     episode = _sine()
     old = np.r_[np.zeros(50), episode.signals["qpos/x"][:-50]]  # read 50 ms late
     replayer = Replayer(plant, [Episode("late", 0.001, episode.ctrl, {"qpos/x": old})], 0.5, ["qpos/x"])
-    late = make_term(plant, "sensor_delay", "qpos/x", Scales()).build(np.array([0.05]))
+    late = make_term(plant, "sensor_delay", "qpos/x", TypicalSizes()).build(np.array([0.05]))
     error = (replayer.simulate([late, Change()]) - replayer.windows.measured)[:, 1:]  # the first window begins before
     assert np.abs(error[0]).max() < 1e-4 < 3e-3 < np.abs(error[1]).max()
 
@@ -123,7 +123,7 @@ def test_a_force_shows_the_command_that_acts_when_it_is_read(delay: float, off: 
 def test_a_drive_knows_its_limits() -> None:
     general = '<general name="motor" joint="x" gear="2" gainprm="3" forcerange="-6 6" ctrlrange="-5 5"/>'
     scene = SLIDE.replace('<motor name="motor" joint="x"/>', general)
-    drive = Drive.of(Plant(mujoco.MjSpec.from_string(scene)).model, "motor", 0)
+    drive = JointActuator.of(Plant(mujoco.MjSpec.from_string(scene)).model, "motor", 0)
     felt, then, now = np.array([[3.0, 1.0, 1.2], [6.0, 2.5, 2.4], [3.0, 1.0, 9.0], [1.5, 6.0, 7.0]]).T
     np.testing.assert_allclose(drive.load(felt, then, now), [2 * 3.6, 2 * 6.0, 2 * 6.0, 2 * 1.5])
 
@@ -153,7 +153,7 @@ def test_the_force_of_a_stiff_servo_is_that_of_the_sample_under_its_new_command(
     error = replayer.simulate([Change()])[0] - w.measured
     assert np.median(np.abs(error)) < 0.02 * size  # what is left comes from the starts; a step late: 0.04
     before = np.array([early[s + 1 : s + 1 + w.samples] for s in w.start])[..., None]
-    error = replayer.read(BEFORE).simulate([Change()])[0] - before
+    error = replayer.with_forces_read(BEFORE).simulate([Change()])[0] - before
     assert np.median(np.abs(error)) < 0.02 * size < np.median(np.abs(before - w.measured))
 
 
@@ -166,7 +166,7 @@ def test_forces_are_compared_on_the_side_of_their_command_where_they_were_read(s
     size = np.abs(force).max()
     error = np.abs(replayer.simulate([Change()])[0] - replayer.windows.measured)
     assert np.median(error) < 0.02 * size and np.quantile(error, 0.9) < 0.04 * size
-    wrong = np.abs(replayer.read(AFTER).simulate([Change()])[0] - replayer.windows.measured)
+    wrong = np.abs(replayer.with_forces_read(AFTER).simulate([Change()])[0] - replayer.windows.measured)
     assert np.quantile(wrong, 0.9) > 0.08 * size
 
 
@@ -218,7 +218,7 @@ def test_in_sharper_steps_dry_friction_turns_at_once() -> None:
 
 def test_effects_in_one_batch_do_not_disturb_each_other(plant) -> None:
     replayer = Replayer(plant, [_sine()], 0.5, ["qpos/x"])
-    terms = candidates(plant, {("geom", "geom0"): Scales()}, None)
+    terms = candidates(plant, {("geom", "geom0"): TypicalSizes()}, None)
     changes = [t.build(t.starts[0]) for t in terms]
     together = replayer.simulate([*changes, Change()])
     for change, values in zip(changes, together[:-1], strict=True):
@@ -228,7 +228,7 @@ def test_effects_in_one_batch_do_not_disturb_each_other(plant) -> None:
 def test_models_whose_arrays_differ_are_never_rolled_out_together() -> None:
     """A friction of two directions adds an actuator without an input, a load on another body other sparse blocks."""
     arm = Plant(mujoco.MjSpec.from_string(TWO_LINKS))
-    scales = {("joint", "elbow"): Scales(), ("body", "upper"): Scales(), ("body", "lower"): Scales()}
+    scales = {("joint", "elbow"): TypicalSizes(), ("body", "upper"): TypicalSizes(), ("body", "lower"): TypicalSizes()}
     rubs, upper, lower = (
         make_term(arm, name, place, scales[kind, place])
         for name, kind, place in (
@@ -240,8 +240,8 @@ def test_models_whose_arrays_differ_are_never_rolled_out_together() -> None:
     for changes in ([Change(), rubs.build(np.array([1.0, 2.0]))], [t.build(np.ones(1)) for t in (upper, lower)]):
         models = [arm.compile(c) for c in changes]
         sizes = {(m.nq, m.nv, m.nu, m.na, m.nbody, m.ntendon, m.neq, m.nM, m.npair) for m in models}
-        assert len(sizes) == 1 and _alike(models, changes) == [[0], [1]]
-        assert _alike([models[1]] * 2, [changes[1]] * 2) == [[0, 1]]
+        assert len(sizes) == 1 and _same_layout(models, changes) == [[0], [1]]
+        assert _same_layout([models[1]] * 2, [changes[1]] * 2) == [[0, 1]]
 
 
 def test_an_effect_that_has_no_place_here_is_refused(plant) -> None:
@@ -256,7 +256,7 @@ def test_every_effect_of_the_table_is_known_and_neutral_at_its_neutral_value(pla
         place = {"joint": "x", "actuator": "motor", "body": "cart", "signal": "qpos/x", "geom": "geom0"}.get(
             __import__(f"envs.effects.{name}", fromlist=["EFFECT"]).EFFECT.place, ""
         )
-        term = make_term(plant, name, place, Scales(peak=5.0))
+        term = make_term(plant, name, place, TypicalSizes(peak=5.0))
         same = replayer.simulate([term.build(np.clip(term.neutral, term.low, term.high))])[0]
         np.testing.assert_allclose(same, nominal, atol=1e-6, err_msg=name)
 
@@ -272,14 +272,14 @@ SHARED = """<mujoco><worldbody><geom name="wall" type="plane" size="2 2 1" frict
 
 
 def test_some_start_of_a_saturation_is_within_a_factor_of_two_of_any_limit(plant) -> None:
-    term = make_term(plant, "torque_saturation", "motor", Scales(peak=8.0))
+    term = make_term(plant, "torque_saturation", "motor", TypicalSizes(peak=8.0))
     for limit in np.linspace(0.1, 1.0, 19) * 8.0:
         assert any(0.5 <= float(s[0]) / limit <= 2.0 for s in term.starts), limit
 
 
 def test_what_shares_a_name_keeps_its_own_size_and_what_touches_is_found() -> None:
     plant = Plant(mujoco.MjSpec.from_string(SHARED))
-    at = scales(plant, Replayer(plant, [_sine()], 0.5, ["qpos/x"]))
+    at = typical_sizes(plant, Replayer(plant, [_sine()], 0.5, ["qpos/x"]))
     rms = float(np.sqrt(np.mean(_sine().ctrl ** 2)))
     assert abs(at["joint", "x"].force - 2 * rms) < 0.05 * rms  # the motor's and inertia's
     assert abs(at["actuator", "x"].command - rms) < 1e-6 and at["body", "x"].mass == 2.0
@@ -292,7 +292,7 @@ def test_a_richer_effect_starts_as_the_simpler_one(plant) -> None:
         ("asymmetric_friction", "viscous_friction", 0.7),
         ("stribeck_friction", "coulomb_friction", 0.3),
     ):
-        old, new = (make_term(plant, n, "x", Scales(), TABLE[n].variants[0]) for n in (simple, rich))
+        old, new = (make_term(plant, n, "x", TypicalSizes(), TABLE[n].variants[0]) for n in (simple, rich))
         a, b = replayer.simulate([old.build(np.array([value])), new.build(enrich(new, old, np.array([value]))[0])])
         np.testing.assert_allclose(a, b, atol=1e-7)
 
@@ -307,12 +307,12 @@ def test_friction_follows_the_load_of_the_simulation_and_not_of_the_recording(pl
     begin = replayer.windows.start[0] * 0.001
     a1, a2 = (1 - c) * 4 / m, -(1 + c) * 4 / m
     replayer.windows = replayer.windows._replace(q0=np.zeros((1, 1)), v0=np.zeros((1, 1)), a0=np.full((1, 1), a1))
-    rub = make_term(plant, "load_dependent_friction", "x", Scales()).build(np.array([c]))
+    friction = make_term(plant, "load_dependent_friction", "x", TypicalSizes()).build(np.array([c]))
     after = 0.001 * np.arange(1, replayer.windows.samples + 1)
     up, late = turn - begin, np.maximum(after - (turn - begin), 0)
     truth = np.where(after < up, a1 * after**2 / 2, a1 * up**2 / 2 + a1 * up * late + a2 * late**2 / 2)
     assert late[-1] < -a1 * up / a2  # it has not turned round yet
-    np.testing.assert_allclose(replayer.simulate([rub])[0, 0, :, 0], truth, atol=2e-5)
+    np.testing.assert_allclose(replayer.simulate([friction])[0, 0, :, 0], truth, atol=2e-5)
 
 
 def test_no_window_starts_where_smoothing_knows_one_side_only(plant) -> None:
@@ -364,7 +364,7 @@ def _window_errors(plant: Plant, change: Change, u: np.ndarray) -> tuple[np.ndar
 def test_rotors_come_to_the_window_as_the_motion_before_left_them() -> None:
     """Within the play nothing pushes the joint, so that its acceleration does not tell where the rotor is."""
     plant = Plant(mujoco.MjSpec.from_string(SLIDE.replace('axis="1 0 0"/>', 'axis="1 0 0" armature="0.5"/>')))
-    play = make_term(plant, "backlash", "x", Scales()).build(np.array([0.02]))
+    play = make_term(plant, "backlash", "x", TypicalSizes()).build(np.array([0.02]))
     led, guessed = _window_errors(plant, play, 4 * np.cos(3 * 0.002 * np.arange(3000)))
     assert (guessed > 3e-3).sum() > 2 > (led > 2e-3).sum() and led.mean() < 0.4 * guessed.mean()
 
@@ -372,7 +372,7 @@ def test_rotors_come_to_the_window_as_the_motion_before_left_them() -> None:
 def test_bristles_come_to_the_window_as_the_motion_before_bent_them(plant) -> None:
     """Where a joint hardly moves, its speed does not tell how far its bristles are bent."""
     numbers = np.array([1.0, 0.5, 0.05, 0.01, 0.3])  # coulomb, excess, velocity, deflection, damping ratio
-    lugre = make_term(plant, "stribeck_friction", "x", Scales()).build(numbers)
+    lugre = make_term(plant, "stribeck_friction", "x", TypicalSizes()).build(numbers)
     led, guessed = _window_errors(plant, lugre, 2 * np.cos(3 * 0.002 * np.arange(3000)))
     assert np.median(led) < 1e-3 and led.mean() < 0.4 * guessed.mean()
 
@@ -388,7 +388,9 @@ def test_a_saturation_starts_near_what_the_motion_needs_however_much_was_asked()
         data.ctrl[0] = command
         mujoco.mj_step(limited, data)
     plant = Plant(mujoco.MjSpec.from_string(scene.format("")))
-    sizes = scales(plant, Replayer(plant, [Episode("a", 0.002, u[:, None], {"qpos/x": np.array(q)})], 0.5, ["qpos/x"]))
+    sizes = typical_sizes(
+        plant, Replayer(plant, [Episode("a", 0.002, u[:, None], {"qpos/x": np.array(q)})], 0.5, ["qpos/x"])
+    )
     term = make_term(plant, "torque_saturation", "motor", sizes["actuator", "motor"])
     assert sizes["actuator", "motor"].peak > 50
     assert min(abs(np.log(float(s[0]) / 0.6)) for s in term.starts) < np.log(1.5), term.starts

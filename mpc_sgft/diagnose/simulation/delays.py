@@ -36,7 +36,7 @@ def _late(plant: Plant, at: tuple[str, ...], values: Mapping[str, float]) -> Cha
     return Change(late={name.removeprefix("qpos/"): values["delay"] for name in names})
 
 
-SIGNALS: dict[str, Build] = {
+DELAYS: dict[str, Build] = {
     "actuator_delay": _delay,
     "actuator_lag": _lag,
     "sensor_delay": _late,

@@ -8,7 +8,7 @@ import pytest
 
 FAULTS = """
 import resource, torch
-from planners.memory import keep_freed_memory
+from planners.malloc import keep_freed_memory
 torch.set_num_threads(1)
 
 def faults():

@@ -7,8 +7,7 @@ import pytest
 
 from mpc_sgft.command.errors import UserError
 from mpc_sgft.diagnose.data.measured import Table
-from mpc_sgft.diagnose.simulation.plant import Axis
-from mpc_sgft.diagnose.units import check_order, check_speeds, check_units
+from mpc_sgft.diagnose.data.units import Axis, check_order, check_speeds, check_units
 
 T = np.arange(1000) * 0.004
 ARM = {"elbow": Axis(-2.9, 2.9)}

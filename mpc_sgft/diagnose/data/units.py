@@ -6,12 +6,12 @@ Each check refuses only what a sound recording cannot show, effects that a simul
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 
 from mpc_sgft.command.errors import UserError
 from mpc_sgft.diagnose.data.measured import Array, Table
-from mpc_sgft.diagnose.simulation.plant import Axis
 
 BEYOND = 3.0  # times the model's range: no joint, stop or offset gets a reading there
 INSIDE = 1.1  # times the range, of readings in the right unit
@@ -22,6 +22,14 @@ ALIKE, UNLIKE = 0.95, 0.3  # correlations, of speeds about zero
 TWICE = 2.0  # a speed that is off by more is in another unit
 LEAD = 3  # samples by which a joint may not be ahead of its command
 REACH = 25  # samples
+
+
+class Axis(NamedTuple):
+    """What a joint's readings can be: its limits [rad or m], infinite where the model has none, and its kind."""
+
+    low: float = -np.inf
+    high: float = np.inf
+    slide: bool = False
 
 
 def check_units(table: Table, joints: Mapping[str, Axis]) -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from mpc_sgft.command import compose
 from mpc_sgft.command.errors import UserError
-from mpc_sgft.diagnose.retrain import outcome, pretrain_config, table
+from mpc_sgft.diagnose.deployments.retrain import outcome, pretrain_config, table
 
 FOUND = {"actuator_gain": {"gain": 0.52}, "payload": {"mass": 0.4, "at": ["puck"]}}
 

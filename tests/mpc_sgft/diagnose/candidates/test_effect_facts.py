@@ -12,8 +12,8 @@ import pytest
 import envs.effects
 from envs.effects.base import available
 from mpc_sgft.diagnose import diagnose
-from mpc_sgft.diagnose.candidates.effect_facts import possible, row_of, size_of
-from mpc_sgft.diagnose.candidates.effect_table import TABLE, Scales
+from mpc_sgft.diagnose.candidates.effect_facts import facts_of, possible, size_from_unit
+from mpc_sgft.diagnose.candidates.effect_table import TABLE, TypicalSizes
 
 CUBIC = '''"""A joint resists with the cube of its speed."""
 from dataclasses import dataclass
@@ -63,7 +63,7 @@ def test_a_new_file_is_looked_for_and_named(cubic_drag: None, slide: Path, recor
 def test_what_a_recording_cannot_show_is_no_candidate() -> None:
     assert possible() == list(TABLE)  # every file has a row, but for these
     assert [n for n in available() if n not in TABLE] == ["frame_rotation", "sensor_noise", "state_torque"]
-    assert row_of("state_torque") is row_of("sensor_noise") is row_of("frame_rotation") is None
+    assert facts_of("state_torque") is facts_of("sensor_noise") is facts_of("frame_rotation") is None
 
 
 @pytest.mark.parametrize(
@@ -80,9 +80,9 @@ def test_what_a_recording_cannot_show_is_no_candidate() -> None:
     ],
 )
 def test_sizes_follow_from_units(unit: str, size: float) -> None:
-    of = size_of(unit)
-    assert of is not None and of(Scales(force=2.0, speed=3.0, travel=5.0, inertia=7.0)) == pytest.approx(size)
+    of = size_from_unit(unit)
+    assert of is not None and of(TypicalSizes(force=2.0, speed=3.0, travel=5.0, inertia=7.0)) == pytest.approx(size)
 
 
 def test_units_that_are_not_mechanical_have_no_size() -> None:
-    assert size_of("") is size_of("of the observation") is size_of("K") is None
+    assert size_from_unit("") is size_from_unit("of the observation") is size_from_unit("K") is None

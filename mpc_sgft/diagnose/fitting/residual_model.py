@@ -12,10 +12,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mpc_sgft.diagnose.candidates.effect_table import Scales
+from mpc_sgft.diagnose.candidates.effect_table import TypicalSizes
 from mpc_sgft.diagnose.data.measured import Array, Index
 from mpc_sgft.diagnose.fitting.fit import by_parts, change_of
-from mpc_sgft.diagnose.fitting.hypothesis import Entry
+from mpc_sgft.diagnose.fitting.hypothesis import Hypothesis
 from mpc_sgft.diagnose.fitting.prepare import Setup
 
 WAVES, RUBS, RANDOM = 12, 3, 12  # per joint: over the position, the same times the direction, of position and speed
@@ -24,7 +24,7 @@ PUSH = 0.01  # of the typical force, to differentiate
 RIDGES = np.logspace(-6, 3, 10)
 
 
-class Flexible(NamedTuple):
+class ResidualModel(NamedTuple):
     """A fitted residual model.
 
     Attributes:
@@ -42,9 +42,9 @@ class Flexible(NamedTuple):
         return float(self.errors.mean())
 
 
-def flexible_fit(
-    setup: Setup, best: Entry, scales: dict[tuple[str, str], Scales], rng: np.random.Generator
-) -> Flexible:
+def fit_residual_model(
+    setup: Setup, best: Hypothesis, scales: dict[tuple[str, str], TypicalSizes], rng: np.random.Generator
+) -> ResidualModel:
     """Fit features on top of a set of effects, whose parameters move along (to first order)."""
     problem, replayer = setup.problem, setup.problem.replayer
     pick = np.concatenate([setup.fitted, setup.held])
@@ -73,10 +73,12 @@ def flexible_fit(
     w = _solve(Xw, rw, lam * free)
     held = X[len(fitted) :, :, :count] @ w[:count]
     squares = np.concatenate([squares, (r0[len(fitted) :] + held) ** 2])
-    return Flexible(setup.judged(by_parts(squares, setup.parts)), (w / norm)[:count], lam)
+    return ResidualModel(setup.judged(by_parts(squares, setup.parts)), (w / norm)[:count], lam)
 
 
-def _features(setup: Setup, scales: dict[tuple[str, str], Scales], rng: np.random.Generator) -> tuple[Array, Array]:
+def _features(
+    setup: Setup, scales: dict[tuple[str, str], TypicalSizes], rng: np.random.Generator
+) -> tuple[Array, Array]:
     """Forces of all features along the recorded motion, in N or N m times PUSH, [F, W, N, nj], and what each costs."""
     replayer = setup.problem.replayer
     w, joints = replayer.windows, replayer.plant.joints

@@ -7,10 +7,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mpc_sgft.diagnose.candidates.library import HIDDEN, Term, enrich, includes
+from mpc_sgft.diagnose.candidates.library import IDLE_WHILE_NEUTRAL, Term, enrich, includes
 from mpc_sgft.diagnose.data.measured import Array, Index
 from mpc_sgft.diagnose.fitting.fit import fit, robust, typical, weights
-from mpc_sgft.diagnose.fitting.hypothesis import Entry
+from mpc_sgft.diagnose.fitting.hypothesis import Hypothesis
 from mpc_sgft.diagnose.fitting.prepare import ABOVE_NOISE, NOISE, Setup
 
 INVISIBLE = 1e-4  # times the noise: an effect of typical size that changes less is no candidate
@@ -23,7 +23,7 @@ class Effort(NamedTuple):
     Attributes:
         beam: Sets that are extended, to two effects, to three.
         full: Candidates that get a full fit: alone, as a second effect, as a third; twice as many get a quick one.
-        screen, sharpen: Windows for one step of each, and for quick fits.
+        screen_windows, quick_windows: Windows for one step of each, and for quick fits.
         quick, last: Iterations of a quick fit, and of the full one that goes on from it.
         enough: Pairs are tried although no effect alone gains, if the error is above this.
         pairs: Of those that the screened effects make, how many get a quick fit.
@@ -32,8 +32,8 @@ class Effort(NamedTuple):
 
     beam: tuple[int, ...] = (2, 1)
     full: tuple[int, ...] = (5, 2, 2)
-    screen: int = 6
-    sharpen: int = 10
+    screen_windows: int = 6
+    quick_windows: int = 10
     quick: int = 3
     last: int = 8
     enough: float = NOISE + ABOVE_NOISE
@@ -66,7 +66,7 @@ class Sample(NamedTuple):
     J: Array
 
 
-def proposals(parent: Entry, terms: Sequence[Term], max_effects: int, shares: tuple[float, ...]) -> list[Option]:
+def proposals(parent: Hypothesis, terms: Sequence[Term], max_effects: int, shares: tuple[float, ...]) -> list[Option]:
     """Sets one step larger, one for each start of the new term."""
     out = []
     base, values = parent.fit.terms, parent.fit.values
@@ -91,7 +91,7 @@ def spread_starts(term: Term, shares: tuple[float, ...]) -> list[Array]:
 
 def smaller(term: Term, start: Array, share: float) -> Array:
     """A start at a share of its distance from no effect."""
-    some = [n not in HIDDEN for n in term.names]
+    some = [n not in IDLE_WHILE_NEUTRAL for n in term.names]
     return np.where(some, term.neutral + share * (start - term.neutral), start)
 
 
@@ -108,7 +108,7 @@ class Option(NamedTuple):
     new: int
 
 
-class Look(NamedTuple):
+class Preview(NamedTuple):
     """An option seen from one Gauss-Newton step.
 
     Attributes:
@@ -126,22 +126,22 @@ class Look(NamedTuple):
 
 
 def screen(
-    setup: Setup[Any], parent: Entry, options: list[Option], windows: int
+    setup: Setup[Any], parent: Hypothesis, options: list[Option], windows: int
 ) -> tuple[list[Proposal], list[Sample]]:
     """Order options by their error after one Gauss-Newton step: of each set the most promising start, of one in which
     an effect becomes a richer one every start, as it is."""
     problem, pick, scale = setup.problem, spread(setup.fitted, windows), typical(parent.fit.r)
-    looks = [look(setup, parent, option, pick) for option in options]
+    previews = [preview(setup, parent, option, pick) for option in options]
     before = float(robust(parent.fit.r[np.searchsorted(setup.fitted, pick)], scale))
-    for last in {_aside(x.option): x for x in looks}.values():  # the smallest start
+    for last in {_idle_start(x.option): x for x in previews}.values():  # the smallest start
         for _ in range(SHRINKS):
             if last.here < before + TOO_MUCH:
                 break
             terms, start, new = last.option
             less = [*start[:new], smaller(terms[new], start[new], 0.1), *start[new + 1 :]]
-            looks.append(last := look(setup, parent, Option(terms, less, new), pick))
-    by_set: dict[Any, list[Look]] = {}
-    for x in looks:
+            previews.append(last := preview(setup, parent, Option(terms, less, new), pick))
+    by_set: dict[Any, list[Preview]] = {}
+    for x in previews:
         richer = x.option.new < len(parent.fit.terms)
         key = key_of(setup, x.option.terms), tuple(x.option.start[x.option.new]) if richer else ()
         if x.sample is not None:
@@ -155,16 +155,16 @@ def screen(
         stay = Proposal(y.option.terms, tuple(y.option.start), y.here)
         first = min([own, *reached, stay], key=lambda p: p.cost)
         out.append(own._replace(cost=first.cost) if richer else first)
-    return sorted(out, key=lambda p: p.cost), [x.sample for x in looks if x.sample is not None]
+    return sorted(out, key=lambda p: p.cost), [x.sample for x in previews if x.sample is not None]
 
 
-def _aside(option: Option) -> tuple[str, ...]:
+def _idle_start(option: Option) -> tuple[str, ...]:
     """An effect, and what its start says of parameters that mean nothing while it is neutral."""
     term, start = option.terms[option.new], option.start[option.new]
-    return term.label, *(f"{n}={x:g}" for n, x in zip(term.names, start, strict=True) if n in HIDDEN)
+    return term.label, *(f"{n}={x:g}" for n, x in zip(term.names, start, strict=True) if n in IDLE_WHILE_NEUTRAL)
 
 
-def look(setup: Setup[Any], parent: Entry, option: Option, pick: Index) -> Look:
+def preview(setup: Setup[Any], parent: Hypothesis, option: Option, pick: Index) -> Preview:
     """Simulate an option at its start and around it, on the picked windows."""
     problem, scale = setup.problem, typical(parent.fit.r)
     rows = np.searchsorted(setup.fitted, pick)
@@ -181,7 +181,7 @@ def look(setup: Setup[Any], parent: Entry, option: Option, pick: Index) -> Look:
     J_new = np.moveaxis((r[1:] - r[0]) * (term.size / np.array(steps))[:, None, None], 0, -1)
     here = float(robust(r[0], scale))
     if np.sqrt(np.mean(J_new**2)) < INVISIBLE:
-        return Look(option, here)
+        return Preview(option, here)
     J_old = parent.fit.J[rows] if new == len(parent.fit.terms) else np.zeros((*r.shape[1:], 0))
     J = np.concatenate([J_old, J_new], -1)
     w = weights(r[0])
@@ -191,15 +191,15 @@ def look(setup: Setup[Any], parent: Entry, option: Option, pick: Index) -> Look:
     tries = [_moved(terms, start, new, step * share, J_old.shape[-1]) for share in (1.0, 0.3)]
     reach = [(b - a) / t.size for t, a, b in zip(terms, start, tries[0], strict=True)]  # as far as bounds allow
     there = float(robust(r[0] + J @ np.concatenate(reach if J_old.shape[-1] else [reach[new]]), scale))
-    return Look(option, here, there, tries, Sample(term, start[new], r[0] - parent.fit.r[rows], J_new))
+    return Preview(option, here, there, tries, Sample(term, start[new], r[0] - parent.fit.r[rows], J_new))
 
 
-def couple(parent: Entry, samples: list[Sample], setup: Setup[Any], effort: Effort) -> list[Proposal]:
+def pair_up(parent: Hypothesis, samples: list[Sample], setup: Setup[Any], effort: Effort) -> list[Proposal]:
     """Pairs of effects that together may do what neither does alone, judged by what each does to the residuals.
 
     The residuals of two effects are taken for the nominal model's, moved by the one and by the other: no simulation.
     """
-    rows = np.searchsorted(setup.fitted, spread(setup.fitted, effort.screen))
+    rows = np.searchsorted(setup.fitted, spread(setup.fitted, effort.screen_windows))
     r0, J0 = parent.fit.r[rows], parent.fit.J[rows]
     root = np.sqrt(weights(r0))[:, None, None]
     parts = [r0[..., None], J0, *(x for s in samples for x in (s.moved[..., None], s.J))]
@@ -239,11 +239,11 @@ def _overlap(a: Term, b: Term) -> bool:
     return includes(a, b) or includes(b, a)
 
 
-def sharpen(setup: Setup[Any], best: Entry, ranked: list[Proposal], effort: Effort) -> list[Proposal]:
+def quick_fits(setup: Setup[Any], best: Hypothesis, ranked: list[Proposal], effort: Effort) -> list[Proposal]:
     """Order proposals anew after a few iterations on some windows: one step says little of some effects."""
     if not ranked:
         return []
-    pick, out = spread(setup.fitted, effort.sharpen), []
+    pick, out = spread(setup.fitted, effort.quick_windows), []
     scale = typical(best.fit.r)
     before = float(np.sum(fit(setup.problem, best.fit.terms, best.fit.values, pick, effort.quick).r ** 2))
     for p in ranked:

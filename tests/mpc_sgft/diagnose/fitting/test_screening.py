@@ -6,13 +6,13 @@ import mujoco
 import numpy as np
 import pytest
 
-from mpc_sgft.diagnose.candidates.effect_table import Scales
+from mpc_sgft.diagnose.candidates.effect_table import TypicalSizes
 from mpc_sgft.diagnose.candidates.library import Term, candidates, enrich, includes, simplify
-from mpc_sgft.diagnose.fitting import screen as screening
+from mpc_sgft.diagnose.fitting import screening as screening
 from mpc_sgft.diagnose.fitting.fit import Fit, fit
-from mpc_sgft.diagnose.fitting.hypothesis import entry
+from mpc_sgft.diagnose.fitting.hypothesis import judge_fit
 from mpc_sgft.diagnose.fitting.prepare import Setup
-from mpc_sgft.diagnose.fitting.screen import proposals, screen
+from mpc_sgft.diagnose.fitting.screening import proposals, screen
 from mpc_sgft.diagnose.simulation.plant import Change, Plant
 
 TRUE = 2e-4  # of the typical size
@@ -51,7 +51,7 @@ def test_an_effect_far_below_its_typical_size_is_seen(
     problem, fitted, none = Steep(), np.arange(18), np.zeros(1)
     base = fit(problem, [], [], fitted)
     setup = Setup(problem, fitted, np.arange(18, 24), fitted // 3, base, none, none, np.log1p)
-    parent = entry(setup, base)
+    parent = judge_fit(setup, base)
     ranked, _ = screen(setup, parent, proposals(parent, [term("a")], 1, (1.0, 0.1, 0.01)), 6)
     assert (0.5 < float(ranked[0].start[0][0]) / TRUE < 2.0) == found
 
@@ -59,7 +59,7 @@ def test_an_effect_far_below_its_typical_size_is_seen(
 def test_a_richer_effect_starts_where_the_simpler_one_ended_whatever_its_idle_parameters() -> None:
     plant = Plant(mujoco.MjSpec.from_string(HINGE))
     dry, rich, bristles = candidates(
-        plant, {("joint", "hinge"): Scales(force=2.0, speed=1.0)}, ["coulomb_friction", "stribeck_friction"]
+        plant, {("joint", "hinge"): TypicalSizes(force=2.0, speed=1.0)}, ["coulomb_friction", "stribeck_friction"]
     )
     starts = enrich(rich, dry, np.array([0.7]))
     assert rich.names == ("coulomb", "excess", "velocity")
@@ -76,7 +76,7 @@ def test_every_effect_of_a_set_counts_however_much_another_shows() -> None:
     setup = Setup(problem, fitted, np.arange(18, 24), fitted // 3, base, none, none, np.log1p)
     J = np.stack([1e6 * problem.column[:18], problem.column[18:].repeat(3, 0)], -1)
     both = Fit((term("a"), term("b")), (np.array([TRUE]), np.zeros(1)), base.r, J)
-    assert entry(setup, both).complexity == 2
+    assert judge_fit(setup, both).complexity == 2
 
 
 class Spring:
@@ -105,7 +105,7 @@ def test_every_rest_of_a_spring_is_tried_with_small_stiffness() -> None:
     problem, fitted, none = Spring(), np.arange(18), 0 * one
     base = fit(problem, [], [], fitted)
     setup = Setup(problem, fitted, np.arange(18, 24), fitted // 3, base, none, none, np.log1p)
-    parent = entry(setup, base)
+    parent = judge_fit(setup, base)
     ranked, _ = screen(setup, parent, proposals(parent, [spring], 1, (1.0, 0.1, 0.01)), 6)
     k, rest = ranked[0].start[0]
     assert rest < -1.5 and 0.3 < k / TRUE < 3

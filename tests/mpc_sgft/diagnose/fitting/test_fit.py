@@ -11,10 +11,10 @@ import pytest
 from mpc_sgft.diagnose.candidates.library import Term
 from mpc_sgft.diagnose.fitting import judge
 from mpc_sgft.diagnose.fitting.fit import Fit, by_parts, fit, left_out_errors
-from mpc_sgft.diagnose.fitting.hypothesis import Entry, entry
-from mpc_sgft.diagnose.fitting.prepare import Setup, cut
+from mpc_sgft.diagnose.fitting.hypothesis import Hypothesis, judge_fit
+from mpc_sgft.diagnose.fitting.prepare import Setup, leave_out_blocks
 from mpc_sgft.diagnose.simulation.plant import Change
-from mpc_sgft.diagnose.verdict.naming import distinct, odds
+from mpc_sgft.diagnose.verdict.naming import distinct, log_odds
 
 SLOPE = Term(
     effect="slope",
@@ -92,8 +92,8 @@ def test_one_of_few_windows_shows_an_effect_if_it_foretells_its_parts_but_for_no
     line.y[2] += odd * np.sin(np.arange(40))
     f = fit(line, [SLOPE], [SLOPE.starts[0]], fitted)
     base = fit(line, [], [], fitted)
-    setup = Setup(line, fitted, np.array([3]), cut(3), base, none, none, np.log1p, parts=8)
-    judged = entry(setup, f)
+    setup = Setup(line, fitted, np.array([3]), leave_out_blocks(3), base, none, none, np.log1p, parts=8)
+    judged = judge_fit(setup, f)
     assert setup.one_window(judged.errors) == trusted
     assert (judged.errors[16:24].max() < 1.5) == trusted
 
@@ -103,21 +103,21 @@ def test_what_the_rest_of_the_data_do_not_determine_is_not_foretold() -> None:
     line.x[1:9] *= 1e-3  # the first window alone shows the slope
     line.y[1:9] = np.random.default_rng(1).normal(size=(8, 40))
     f, base = fit(line, [SLOPE], [SLOPE.starts[0]], fitted), fit(line, [], [], fitted)
-    setup = Setup(line, fitted, np.array([8]), cut(8), base, none, none, np.log1p)
-    assert np.log1p(left_out_errors(f, cut(8)[:, None]))[0] > 2 * entry(setup, base).errors[0]
-    assert entry(setup, f).errors[0] == entry(setup, base).errors[0]
+    setup = Setup(line, fitted, np.array([8]), leave_out_blocks(8), base, none, none, np.log1p)
+    assert np.log1p(left_out_errors(f, leave_out_blocks(8)[:, None]))[0] > 2 * judge_fit(setup, base).errors[0]
+    assert judge_fit(setup, f).errors[0] == judge_fit(setup, base).errors[0]
 
 
 def test_of_several_effects_each_must_be_credibly_away_from_none() -> None:
     line, every, none = Line(), np.arange(19), np.zeros(1)
     base, rng = fit(line, [], [], every), np.random.default_rng(5)
-    setup = Setup(line, every, np.array([19]), cut(19), base, none, none, np.log1p)
+    setup = Setup(line, every, np.array([19]), leave_out_blocks(19), base, none, none, np.log1p)
 
-    def second(x: np.ndarray) -> Entry:
+    def second(x: np.ndarray) -> Hypothesis:
         """The slope, and an effect with these derivatives [19, 40] that is found to be 1."""
         f = fit(line, [SLOPE], [np.full(1, 2.0)], every)
         both = (*f.terms, replace(SLOPE, effect="other"))
-        return entry(setup, Fit(both, (*f.values, np.ones(1)), f.r, np.concatenate([f.J, x[..., None]], 2)))
+        return judge_fit(setup, Fit(both, (*f.values, np.ones(1)), f.r, np.concatenate([f.J, x[..., None]], 2)))
 
     assert distinct(second(rng.normal(size=(19, 40)))) and not distinct(second(0.01 * rng.normal(size=(19, 40))))
 
@@ -130,29 +130,29 @@ def test_parts_by_hand() -> None:
 
 def test_a_rival_that_is_worse_by_next_to_nothing_ties_however_surely_it_is_worse() -> None:
     rng, best = np.random.default_rng(0), np.linspace(0.5, 0.9, 40)
-    assert not judge.worse(best + 0.005, best, rng)
-    assert judge.worse(best + 0.02, best, rng)
+    assert not judge.ruled_out(best + 0.005, best, rng)
+    assert judge.ruled_out(best + 0.02, best, rng)
 
 
 def test_where_noise_alone_is_left_a_rival_is_ruled_out_by_its_odds() -> None:
     line, every, none = Line(), np.arange(19), np.zeros(1)
     base, rng = fit(line, [], [], every), np.random.default_rng(0)
-    setup = Setup(line, every, np.array([18]), cut(19), base, none, none, np.log1p)
-    best, rival = (entry(setup, fit(line, [SLOPE], [np.full(1, a)], every, 0)) for a in (2.0, 2.05))
+    setup = Setup(line, every, np.array([18]), leave_out_blocks(19), base, none, none, np.log1p)
+    best, rival = (judge_fit(setup, fit(line, [SLOPE], [np.full(1, a)], every, 0)) for a in (2.0, 2.05))
     apart = ((2.05 * line.x - line.y) ** 2 - (2.0 * line.x - line.y) ** 2)[[*range(19), 18]].sum() / 2
-    assert odds(setup, best, rival) == pytest.approx(apart)
+    assert log_odds(setup, best, rival) == pytest.approx(apart)
     even, one = np.zeros(24), np.where(np.arange(24) == 0, 0.6, 0.0)
-    assert not judge.worse(one, even, rng) and not judge.worse(one, even, rng, odds=np.log(19))
-    assert judge.worse(one, even, rng, odds=np.log(21))
-    assert judge.worse(even + 0.02, even, rng) and not judge.worse(even + 0.02, even, rng, odds=np.log(19))
+    assert not judge.ruled_out(one, even, rng) and not judge.ruled_out(one, even, rng, log_odds=np.log(19))
+    assert judge.ruled_out(one, even, rng, log_odds=np.log(21))
+    assert judge.ruled_out(even + 0.02, even, rng) and not judge.ruled_out(even + 0.02, even, rng, log_odds=np.log(19))
 
 
 def test_where_noise_alone_is_left_great_odds_need_no_confidence() -> None:
     rng, after = np.random.default_rng(0), np.full(24, 0.5)
     before = after + np.where(np.arange(24) % 2, 0.6, -0.4)  # 0.1 on average, and less in every other part
-    assert not judge.credible(before, after, rng) and not judge.credible(before, after, rng, odds=np.log(999))
-    assert judge.credible(before, after, rng, odds=np.log(1001))
-    assert not judge.credible(after + 0.01, after, rng, odds=np.log(1001))
+    assert not judge.credible(before, after, rng) and not judge.credible(before, after, rng, log_odds=np.log(999))
+    assert judge.credible(before, after, rng, log_odds=np.log(1001))
+    assert not judge.credible(after + 0.01, after, rng, log_odds=np.log(1001))
 
 
 class Rugged(Line):
