@@ -52,6 +52,8 @@ def load(draws: Mapping[str, Mapping[str, Any]]) -> list[Draw]:
     Raises:
         ValueError: For an unknown or missing key, or a value that is not allowed.
     """
+    if not isinstance(draws, Mapping):
+        raise ValueError(f"draws={draws} must map names to draws; {{}} for none")
     built = []
     for name, entries in draws.items():
         try:

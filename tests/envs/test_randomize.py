@@ -191,3 +191,8 @@ def test_observation_noise_falls_on_its_share_of_the_episodes(make_backend) -> N
     hit = error.any(1)
     assert 0.2 < hit.mean() < 0.4
     assert error[hit].std() == pytest.approx(0.004, rel=0.2)
+
+
+def test_draws_that_are_no_mapping_are_refused():
+    with pytest.raises(ValueError, match="must map names to draws"):
+        randomize.load([])  # type: ignore[arg-type]

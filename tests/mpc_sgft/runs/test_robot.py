@@ -21,7 +21,7 @@ def config(*given: str):
     ("given", "words"),
     [
         ((), "needs --robot-ip"),
-        (("robot-ip=10.0.0.1",), "sees the stand-in's table alone"),
+        (("robot-ip=10.0.0.1",), "sees the stand-in's scene alone"),
         (("robot-ip=stand-in", "perception=fixed"), "no camera"),
         (("robot-ip=10.0.0.1", "perception=fixed", "backend.clock=robot"), "needs real time"),
         (("robot-ip=stand-in", "task=pendulum"), "pendulum cannot run on the robot"),
