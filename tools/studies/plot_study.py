@@ -1,6 +1,8 @@
 """Learning curves of a study: mean over seeds with a bootstrap interval, a panel for each gap.
 
-python -m tools.studies.plot_study results/transfer/sgft.csv results/transfer/tdmpc2.csv results/transfer/transfer.png
+    python -m tools.studies.plot_study results/transfer/sgft.csv results/transfer/tdmpc2.csv OUT.png
+
+For the results page OUT.png is results/transfer/transfer.png. Takes seconds.
 """
 
 import argparse
