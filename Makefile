@@ -33,7 +33,7 @@ $(STAMP): requirements.lock pyproject.toml
 	@touch $(STAMP)
 
 system: ## Install the apt packages for rendering without a screen (root, or sudo that asks nothing).
-	@missing=""; for p in $(APT); do dpkg -s $$p > /dev/null 2>&1 || missing="$$missing $$p"; done; \
+	@missing=""; for p in $(APT); do [ "$$(dpkg-query -Wf '$${db:Status-Abbrev}' $$p 2> /dev/null)" = "ii " ] || missing="$$missing $$p"; done; \
 	sudo=""; [ "$$(id -u)" = 0 ] || sudo="sudo -n"; \
 	if [ -z "$$missing" ]; then echo "system packages: all there"; \
 	elif ! command -v apt-get > /dev/null; then echo "no apt-get here: what draws without a screen is left out; it needs$$missing"; \

@@ -3,11 +3,9 @@
 import os
 import subprocess
 import sys
-from ctypes.util import find_library
 from pathlib import Path
 
 import numpy as np
-import pytest
 import torch
 from PIL import Image, ImageChops, ImageSequence
 
@@ -81,9 +79,8 @@ assert np.unique(here[:5].reshape(-1, 3), axis=0).shape == (1, 3)  # one colour 
 """
 
 
-@pytest.mark.skipif(find_library("EGL") is None, reason="needs libegl1 (make system)")
-def test_the_pictures_show_the_puck_and_the_line(tmp_path: Path) -> None:
-    env = {**os.environ, "MUJOCO_GL": "egl", "PYTHONPATH": str(ROOT)}
+def test_the_pictures_show_the_puck_and_the_line(mujoco_gl, tmp_path: Path) -> None:
+    env = {**os.environ, "MUJOCO_GL": mujoco_gl, "PYTHONPATH": str(ROOT)}
     line = [sys.executable, "-W", "ignore", "-c", DRAW]
     done = subprocess.run(line, cwd=tmp_path, env=env, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr

@@ -38,7 +38,7 @@ def test_an_abort_is_named_and_ends_with_1(tmp_path: Path) -> None:
     [
         (["--resets", "0"], "--resets must be above 0"),
         (["--resets", "1", "--steps", "1000"], "More --resets"),
-        (["--robot-ip", "127.77.77.77"], "sees the stand-in's table alone"),
+        (["--robot-ip", "127.77.77.77"], "sees the stand-in's scene alone"),
         (["--robot-ip", "127.77.77.77", "--set", "perception=fixed"], "no robot answers at 127.77.77.77"),
         (["--set", "backend.gripper.width=0"], "backend.gripper: width=0"),
     ],
