@@ -18,6 +18,7 @@ from mpc_sgft.learning.layers import (
     gaussian_tanh,
     mish,
     mlp,
+    simnorm,
     symexp,
     symlog,
 )
@@ -58,6 +59,12 @@ def test_simnorm_groups_are_distributions_and_equal_softmax():
     assert_close(z.view(7, 4, 8).sum(-1), torch.ones(7, 4))
     assert_close(z, x.view(7, 4, 8).softmax(-1).flatten(1), rtol=1e-5, atol=1e-6)
     assert SimNorm(8)(torch.full((1, 32), 1e6)).isfinite().all()
+
+
+def test_simnorm_slope_is_that_of_the_softmax():
+    x = torch.randn(3, 5, 16, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda x: simnorm(x, 4), x)
+    assert_close(simnorm(x, 4), x.unflatten(-1, (4, 4)).softmax(-1).flatten(-2))
 
 
 @pytest.mark.parametrize("grad", [False, True])
