@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from planners.base import (
+    PRECISIONS,
     Model,
     Plan,
     check_discount,
@@ -15,6 +16,7 @@ from planners.base import (
     h_step_return,
     imagine_policy,
     imagined_return,
+    plan_values,
 )
 
 
@@ -27,8 +29,7 @@ class SamplingPlanner(ABC):
 
         mean = Σ_k w_k a_k        std = sqrt(Σ_k w_k (a_k - mean)²), clamped to [min_std, max_std]
 
-    configs/planner/<name>.yaml says what every number does. chunk_rows is for CPUs: plans imagined at a time, so that
-    intermediate results stay in cache.
+    configs/planner/<name>.yaml says what every number does.
 
     Raises:
         ValueError: From the constructor, if a number is out of range.
@@ -44,6 +45,7 @@ class SamplingPlanner(ABC):
     max_std: float = 2.0
     discount: float = 0.99
     chunk_rows: int = 1024
+    precision: str = "auto"
 
     def __post_init__(self) -> None:
         check_discount(self.discount)
@@ -54,6 +56,8 @@ class SamplingPlanner(ABC):
             raise ValueError(f"num_prior={self.num_prior} is outside [0, num_candidates={self.num_candidates}).")
         if self.num_elites > self.num_candidates:
             raise ValueError(f"num_elites={self.num_elites} exceeds num_candidates={self.num_candidates}.")
+        if self.precision not in PRECISIONS:
+            raise ValueError(f"precision={self.precision!r}. Available: {', '.join(PRECISIONS)}.")
         if not 0 < self.min_std <= self.max_std:
             raise ValueError(f"0 < min_std <= max_std does not hold: min_std={self.min_std}, max_std={self.max_std}.")
 
@@ -101,12 +105,12 @@ class SamplingPlanner(ABC):
             check_followed(who, latents, pool[:, :prior])
             values[:, :prior] = imagined_return(model, latents, pool[:, :prior], self.discount)
 
-        starts = z.repeat_interleave(self.num_candidates - prior, 0)  # [B (N - P), D]
+        returns = plan_values(model, z, self.discount, self.precision, self.chunk_rows)
         noise = torch.empty_like(pool[:, prior:])
         for _ in range(self.iterations):
             noise.normal_(generator=generator)
             pool[:, prior:] = torch.addcmul(mean.unsqueeze(1), std.unsqueeze(1), noise).clamp_(-1, 1)
-            values[:, prior:] = self._evaluate(model, starts, pool[:, prior:])
+            values[:, prior:] = returns(pool[:, prior:])
             check_finite(who, "candidate values", values)
             mean, std = self.refit(pool, values)
         check_finite(who, "planned actions", mean)
@@ -127,13 +131,6 @@ class SamplingPlanner(ABC):
         mean = (weight * elites).sum(1).clamp(-1, 1)  # rounding may leave [-1, 1]
         variance = (weight * (elites - mean.unsqueeze(1)).square()).sum(1)
         return mean, variance.sqrt().clamp(self.min_std, self.max_std)
-
-    def _evaluate(self, model: Model, starts: Tensor, actions: Tensor) -> Tensor:
-        """Return of the plans [B, n, H, A] from latents [B n, D], [B, n]."""
-        rows = len(starts) if starts.is_cuda else self.chunk_rows
-        chunks = zip(starts.split(rows), actions.flatten(0, 1).split(rows), strict=True)
-        values = torch.cat([h_step_return(model, z, plans, self.discount) for z, plans in chunks])
-        return values.view(actions.shape[:2])
 
     def _warm_start(self, z: Tensor, previous: Plan | None, fresh: Tensor | None) -> Tensor:
         """The previous mean one step on, zero where an episode just started, [B, H, A]."""

@@ -212,10 +212,11 @@ def test_exploring_draws_around_the_mean_with_the_final_std(double_integrator, k
         {"min_std": 0.0},
         {"max_std": 0.01},
         {"chunk_rows": 0},
+        {"precision": "half"},
     ],
 )
 def test_numbers_out_of_range_are_refused(kind: type[MPPI] | type[CEM], bad: dict[str, float]) -> None:
-    with pytest.raises(ValueError, match=f"{next(iter(bad))}={next(iter(bad.values()))}"):
+    with pytest.raises(ValueError, match=f"{next(iter(bad))}={next(iter(bad.values()))!r}"):
         kind(action_dim=2, **bad)
 
 

@@ -1,0 +1,48 @@
+"""In which precision the matrix products of a plan run."""
+
+import warnings
+from functools import cache
+
+import torch
+
+from planners.base import PRECISIONS
+
+WIDE = 256  # hidden units from which bfloat16 products save more than rounding costs
+
+
+def dtype_of_products(precision: str, width: int, device: torch.device) -> torch.dtype:
+    """The type that `planner.precision=` asks for.
+
+    Args:
+        precision: Of planners.base.PRECISIONS; auto is bfloat16 for wide models where the processor has its products.
+        width: Hidden units of the heads.
+        device: Where they are.
+
+    Raises:
+        ValueError: If precision is unknown.
+    """
+    if precision not in PRECISIONS:
+        raise ValueError(f"precision={precision!r}. Available: {', '.join(PRECISIONS)}.")
+    if precision == "float32" or (precision == "auto" and (width < WIDE or not has_bfloat16(device.type))):
+        return torch.float32
+    if not has_bfloat16(device.type):
+        _warn_once()
+    return torch.bfloat16
+
+
+@cache
+def has_bfloat16(device: str) -> bool:
+    """Whether products of bfloat16 run in hardware on a device type."""
+    if device == "cuda":
+        return torch.cuda.is_bf16_supported(including_emulation=False)
+    able = torch.cpu.get_capabilities()
+    return any(able.get(name, False) for name in ("avx512_bf16", "amx_bf16", "bf16", "sve_bf16"))
+
+
+@cache
+def _warn_once() -> None:
+    warnings.warn(
+        "planner.precision=bfloat16: this processor has no bfloat16 products and takes a detour through float32; they "
+        "take about three times as long. Use planner.precision=auto or float32.",
+        stacklevel=3,
+    )
