@@ -74,7 +74,9 @@ class PlanWeights:
         self.at_start: tuple[str, ...] = ("dynamics", "reward") if early else ("dynamics",)
         self.on_the_way: tuple[str, ...] = ("dynamics", "reward")
         self.at_end: tuple[str, ...] = ("value",) if early else ("value", "reward")
-        self._first = {names: self._joined(names) for names in (self.at_start, self.on_the_way, self.at_end)}
+        self._first: dict[tuple[str, ...], tuple[Tensor, Tensor]] = {
+            names: self._joined(names) for names in (self.at_start, self.on_the_way, self.at_end)
+        }
 
     def _joined(self, names: tuple[str, ...]) -> tuple[Tensor, Tensor]:
         weights, biases = zip(*(self.heads[name].on_code for name in names), strict=True)

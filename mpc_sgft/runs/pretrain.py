@@ -3,6 +3,8 @@
 import json
 import signal
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from types import FrameType
 
 import torch
@@ -32,12 +34,13 @@ def pretrain(cfg: DictConfig) -> int:
     agent.imagined_steps = cfg.imagined_steps
     buffer = instantiate(cfg.train.replay, seed=cfg.seed)
     state = {"round": 0, "updates": 0, "transitions": 0, "episodes": 0, "seconds": 0.0, "streak": 0}
+    watch = Stopwatch("collect", "update", "evaluate", "save")
     saved = folder / "checkpoint" / "state.pt"
     if cfg.resume is not None:
         if not saved.is_file():
             raise UserError(f"{folder} holds no checkpoint yet: nothing to resume. Start it again with run_dir=...")
         stored = checkpoint.load_state(saved)
-        state = stored["loop"]
+        state, watch.spent = stored["loop"], stored["spent"]
         agent.load_state_dict(stored["agent"])
         buffer.load_state_dict(stored["buffer"])
 
@@ -45,7 +48,8 @@ def pretrain(cfg: DictConfig) -> int:
         """Weights and exact state, at the end of a round."""
         meta = checkpoint.describe(cfg, agent.averaged, extra={"transitions": state["transitions"]})
         checkpoint.save(folder / "checkpoint" / "model.safetensors", agent.averaged, meta)
-        checkpoint.save_state(saved, {"loop": state, "agent": agent.state_dict(), "buffer": buffer.state_dict()})
+        parts = {"loop": state, "spent": watch.spent}
+        checkpoint.save_state(saved, {**parts, "agent": agent.state_dict(), "buffer": buffer.state_dict()})
 
     stop = StopRequest("round")
     logger = MetricLogger(
@@ -60,20 +64,23 @@ def pretrain(cfg: DictConfig) -> int:
     while state["transitions"] < cfg.transitions:
         first_round = state["transitions"] < cfg.random_transitions
         act = random_policy(env, cfg.seed) if first_round else explorer(agent, cfg, state["round"])
-        data = collect(env, act, seed=_seed(cfg.seed, state["round"]), first_episode=state["episodes"])
-        buffer.extend(data)
+        with watch("collect"):
+            data = collect(env, act, seed=_seed(cfg.seed, state["round"]), first_episode=state["episodes"])
+            buffer.extend(data)
         state["transitions"] += data.numel()
         state["episodes"] = int(data["episode"].max()) + 1
         metrics: dict[str, float] = {"train_success": score(data).success}
         agent.scale_learning_rates(0.5 ** (state["transitions"] / cfg.lr_halves_every))
         agent.hold_value(state["transitions"] <= cfg.hold_value)
         owed = int(state["transitions"] * cfg.updates_per_transition) - state["updates"]
-        for _ in range(owed):
-            metrics |= agent.update(buffer.sample())
+        with watch("update"):
+            for _ in range(owed):
+                metrics |= agent.update(buffer.sample())
         state["updates"] += owed
         state["round"] += 1
         if state["round"] % cfg.eval_every == 0 or state["transitions"] >= cfg.transitions:
-            result = score(collect(judge, prior(agent), seed=EVAL_SEED))
+            with watch("evaluate"):
+                result = score(collect(judge, prior(agent), seed=EVAL_SEED))
             metrics |= {"success": result.success, "return": result.episode_return}
             state["streak"] = state["streak"] + 1 if result.success >= cfg.target_success else 0
         state["seconds"] = time.monotonic() - began
@@ -83,7 +90,8 @@ def pretrain(cfg: DictConfig) -> int:
         bar.set_postfix(success=f"{result.success:.0%}" if result else "-", loss=f"{metrics.get('loss', 0):.2f}")
         done = state["streak"] >= cfg.target_streak and state["transitions"] >= cfg.min_transitions
         if stop.asked or done or state["round"] % cfg.save_every == 0:
-            save()
+            with watch("save"):
+                save()
         if stop.asked:
             raise Stopped(
                 f"saved after {state['transitions']} transitions. Go on: python -m mpc_sgft.pretrain --resume {folder}"
@@ -93,9 +101,10 @@ def pretrain(cfg: DictConfig) -> int:
     save()
     bar.close()
     final_judge = build.make_env(cfg, cfg.final_episodes, randomised=True)
-    final = score(collect(final_judge, prior(agent), seed=EVAL_SEED + 1))
     planner = build.make_planner(cfg, env.action_dim)
-    planned = score(collect(final_judge, planner_policy(agent.averaged, planner, cfg.seed), seed=EVAL_SEED + 1))
+    with watch("evaluate"):
+        final = score(collect(final_judge, prior(agent), seed=EVAL_SEED + 1))
+        planned = score(collect(final_judge, planner_policy(agent.averaged, planner, cfg.seed), seed=EVAL_SEED + 1))
     summary = {
         "task": cfg.chosen.task,
         "seed": cfg.seed,
@@ -108,6 +117,7 @@ def pretrain(cfg: DictConfig) -> int:
         "return": planned.episode_return,
         "unstable_episodes": env.backend.counters["unstable"],
         "wall_seconds": round(time.monotonic() - began, 1),
+        "seconds": {part: round(seconds, 1) for part, seconds in watch.spent.items()},
         "checkpoint": str(folder / "checkpoint" / "model.safetensors"),
     }
     (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
@@ -166,6 +176,19 @@ def explorer(agent: Agent, cfg: DictConfig, round_number: int) -> Act:
 def prior(agent: Agent) -> Act:
     """The mean action of the averaged policy prior."""
     return planner_policy(agent.averaged, PolicyPlanner(action_dim=agent.model.action_dim, horizon=1), 0)
+
+
+class Stopwatch:
+    """Adds up the seconds that the parts of a loop take."""
+
+    def __init__(self, *parts: str) -> None:
+        self.spent = dict.fromkeys(parts, 0.0)
+
+    @contextmanager
+    def __call__(self, part: str) -> Iterator[None]:
+        start = time.monotonic()
+        yield
+        self.spent[part] += time.monotonic() - start
 
 
 class StopRequest:
