@@ -3,7 +3,8 @@
 import copy
 import hashlib
 from collections.abc import Callable, Mapping
-from typing import Any, cast
+from functools import wraps
+from typing import Any, Concatenate, ParamSpec, TypeVar, cast
 
 import torch
 from tensordict import TensorDictBase
@@ -11,11 +12,27 @@ from torch import Tensor
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from mpc_sgft.learning import losses
+from mpc_sgft.learning.layers import products_in
+from mpc_sgft.learning.precision import dtype_of_products
 from mpc_sgft.learning.slices import Slices, check_finite, to_slices
 from mpc_sgft.learning.world_model import WorldModel
 
 PRETRAINED = ("encoder", "dynamics", "reward_head", "q_ensemble", "value_head", "policy_head", "decoder")
 FOLLOWING = ("normalizer", "target_q")  # not by gradient
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+def _in_own_precision(method: Callable[Concatenate["Agent", P], R]) -> Callable[Concatenate["Agent", P], R]:
+    """Run a method of the agent with the matrix products of its `precision`."""
+
+    @wraps(method)
+    def within(self: "Agent", *args: P.args, **kwargs: P.kwargs) -> R:
+        with products_in(self.products):
+            return method(self, *args, **kwargs)
+
+    return within
 
 
 class Agent:
@@ -56,6 +73,7 @@ class Agent:
         scale_rate: float,
         entropy_coef: float,
         entropy_lr: float,
+        precision: str = "float32",
     ) -> None:
         if not 0 <= discount <= 1 or not 0 < rho <= 1:
             raise ValueError(f"discount must lie in [0, 1] and rho in (0, 1], got discount={discount}, rho={rho}.")
@@ -70,6 +88,7 @@ class Agent:
             "value_loss": value_weight,
             "decoder_loss": decoder_weight,
         }
+        self.products = dtype_of_products(precision, int(model.sizes["mlp_dim"]), self.device)
         self.generator = torch.Generator(self.device).manual_seed(seed)
         self.scale = losses.RunningScale(scale_rate, self.device)
         self.log_entropy_coef = torch.tensor(entropy_coef, device=self.device).log().requires_grad_()
@@ -96,6 +115,7 @@ class Agent:
 
     # -- learning in simulation ----------------------------------------------------------------------------------------
 
+    @_in_own_precision
     def update(self, batch: TensorDictBase) -> dict[str, float]:
         """One step of the TD-MPC2 objective with a value head, on slices [B, T]; returns metrics.
 
@@ -219,6 +239,7 @@ class Agent:
         modules = (dynamics.base, dynamics.residual)
         return [p for module in modules if module for p in module.parameters() if p.requires_grad]
 
+    @_in_own_precision
     def fit_dynamics(
         self,
         data: Slices,
@@ -257,6 +278,7 @@ class Agent:
         self.model_optimizer.step()
         return metrics, encoded
 
+    @_in_own_precision
     def climb(self, starts: Tensor, *, horizon: int, entropy_coef: float) -> dict[str, Tensor]:
         """A step of the policy prior up the SGFT objective of `horizon` imagined steps from latents [B, D]."""
         return self._climb(starts, horizon, entropy_coef)[0]

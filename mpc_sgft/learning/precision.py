@@ -1,4 +1,4 @@
-"""In which precision the matrix products of a plan run."""
+"""In which precision the matrix products of plans and updates run."""
 
 import warnings
 from functools import cache
@@ -11,7 +11,7 @@ WIDE = 256  # hidden units from which bfloat16 products save more than rounding 
 
 
 def dtype_of_products(precision: str, width: int, device: torch.device) -> torch.dtype:
-    """The type that `planner.precision=` asks for.
+    """The type that `planner.precision=` or `train.agent.precision=` asks for.
 
     Args:
         precision: Of planners.base.PRECISIONS; auto is bfloat16 for wide models where the processor has its products.
@@ -42,7 +42,7 @@ def has_bfloat16(device: str) -> bool:
 @cache
 def _warn_once() -> None:
     warnings.warn(
-        "planner.precision=bfloat16: this processor has no bfloat16 products and takes a detour through float32; they "
-        "take about three times as long. Use planner.precision=auto or float32.",
+        "precision=bfloat16: this processor has no bfloat16 products and takes a detour through float32; they "
+        "take about three times as long. Use precision=auto or float32.",
         stacklevel=3,
     )

@@ -97,6 +97,15 @@ def test_pretraining_moves_every_part_and_reports_floats(num_q):
     assert {"loss", "consistency_loss", "reward_loss", "q_loss", "value_loss", "policy_loss", "entropy"} <= set(metrics)
 
 
+def test_an_update_in_bfloat16_goes_the_way_of_float32_and_keeps_its_weights_in_it():
+    exact, rounded = (make_agent(precision=precision) for precision in ("float32", "bfloat16"))
+    batch = make_batch()
+    for _ in range(20):
+        right, near = exact.update(batch), rounded.update(batch)
+    assert near["loss"] != right["loss"] and near["loss"] == pytest.approx(right["loss"], rel=0.02)
+    assert {p.dtype for p in rounded.model.parameters()} == {torch.float32}
+
+
 @pytest.mark.parametrize("terminated", [False, True])
 def test_value_and_critics_learn_the_constant_reward_value(terminated):
     """r = 1 for ever is worth 1 / (1 - gamma) = 5; a step that ends the episode is worth 1."""

@@ -10,6 +10,7 @@ from torch.testing import assert_close
 from mpc_sgft.learning.layers import (
     BLOCK_ROWS,
     Ensemble,
+    Linear,
     Normalizer,
     SimNorm,
     TwoHot,
@@ -18,6 +19,7 @@ from mpc_sgft.learning.layers import (
     gaussian_tanh,
     mish,
     mlp,
+    products_in,
     simnorm,
     symexp,
     symlog,
@@ -65,6 +67,22 @@ def test_simnorm_slope_is_that_of_the_softmax():
     x = torch.randn(3, 5, 16, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(lambda x: simnorm(x, 4), x)
     assert_close(simnorm(x, 4), x.unflatten(-1, (4, 4)).softmax(-1).flatten(-2))
+
+
+def test_rounded_products_and_their_slopes_are_near_the_exact_ones():
+    layer, x = Linear(64, 32), torch.randn(3, 50, 64, requires_grad=True)
+    exact = layer(x)
+    slopes = torch.autograd.grad(exact.square().sum(), (x, layer.weight, layer.bias))
+    with products_in(torch.bfloat16):
+        rounded = layer(x)
+    assert rounded.dtype == torch.float32 and not torch.equal(rounded, exact)
+    assert_close(rounded, exact, rtol=0, atol=0.02 * exact.std().item())
+    for near, slope in zip(
+        torch.autograd.grad(rounded.square().sum(), (x, layer.weight, layer.bias)), slopes, strict=True
+    ):
+        assert near.dtype == torch.float32 and near.shape == slope.shape
+        assert (near - slope).norm() < 0.02 * slope.norm()
+    assert torch.equal(layer(x), exact)  # only within
 
 
 @pytest.mark.parametrize("grad", [False, True])
