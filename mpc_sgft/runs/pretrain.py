@@ -7,16 +7,15 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-import torch
 from hydra.utils import instantiate
 from omegaconf import DictConfig
-from torch import Tensor
 
 from envs.env import ControlEnv
-from mpc_sgft.command.errors import Stopped, UserError
+from mpc_sgft.command.errors import Stopped, UserError, from_config
 from mpc_sgft.learning.agent import Agent
 from mpc_sgft.runs import build
-from mpc_sgft.runs.collect import Act, collect, planner_policy, random_policy, score
+from mpc_sgft.runs.collect import Act, collect, planner_policy, score
+from mpc_sgft.runs.explore import Collected, Round, policy_weights
 from mpc_sgft.storage import checkpoint, run_folder
 from mpc_sgft.storage.metrics import MetricLogger, progress
 from planners.policy import PolicyPlanner
@@ -28,13 +27,13 @@ def pretrain(cfg: DictConfig) -> int:
     """Pretrain until the target success is held or the transitions are spent; returns the exit code."""
     folder = run_folder.start(cfg)
     build.prepare_process(cfg)
-    env = build.make_env(cfg, cfg.num_envs, randomised=True, learning=True)
     judge = build.make_env(cfg, cfg.eval_episodes, randomised=True)
-    agent = start_agent(cfg, env)
+    agent = start_agent(cfg, judge)
+    round_size = cfg.num_envs * judge.task.episode_steps
     agent.imagined_steps = cfg.imagined_steps
     buffer = instantiate(cfg.train.replay, seed=cfg.seed)
-    state = {"round": 0, "updates": 0, "transitions": 0, "episodes": 0, "seconds": 0.0, "streak": 0}
-    watch = Stopwatch("collect", "update", "evaluate", "save")
+    state = {"round": 0, "updates": 0, "transitions": 0, "episodes": 0, "seconds": 0.0, "streak": 0, "unstable": 0}
+    watch = Stopwatch("wait", "update", "evaluate", "save")
     saved = folder / "checkpoint" / "state.pt"
     if cfg.resume is not None:
         if not saved.is_file():
@@ -43,12 +42,20 @@ def pretrain(cfg: DictConfig) -> int:
         state, watch.spent = stored["loop"], stored["spent"]
         agent.load_state_dict(stored["agent"])
         buffer.load_state_dict(stored["buffer"])
+    with from_config("collector"):
+        collector = instantiate(cfg.collector, _partial_=True)(cfg=cfg, sizes=agent.model.sizes)
+
+    def plan_round(number: int) -> Round:
+        """A round for the policy of now; the first ones act at random."""
+        at_random = number * round_size < cfg.random_transitions
+        return Round(number, None if at_random else policy_weights(agent.model))
 
     def save() -> None:
         """Weights and exact state, at the end of a round."""
         meta = checkpoint.describe(cfg, agent.averaged, extra={"transitions": state["transitions"]})
         checkpoint.save(folder / "checkpoint" / "model.safetensors", agent.averaged, meta)
-        parts = {"loop": state, "spent": watch.spent}
+        ahead = collector.result().state_dict() if state["transitions"] < cfg.transitions else None
+        parts = {"loop": state, "spent": watch.spent, "order": tuple(order), "ahead": ahead}
         checkpoint.save_state(saved, {**parts, "agent": agent.state_dict(), "buffer": buffer.state_dict()})
 
     stop = StopRequest("round")
@@ -61,14 +68,23 @@ def pretrain(cfg: DictConfig) -> int:
     )
     bar = progress(cfg.transitions, initial=state["transitions"], desc="pretrain", disable=cfg.quiet)
     result, began = None, time.monotonic() - state["seconds"]
+    order, ahead = plan_round(0), None
+    if cfg.resume is not None:
+        order, ahead = Round(*stored["order"]), stored["ahead"] and Collected.of(stored["ahead"])
+    if ahead is None and state["transitions"] < cfg.transitions:
+        collector.start(order)
     while state["transitions"] < cfg.transitions:
-        first_round = state["transitions"] < cfg.random_transitions
-        act = random_policy(env, cfg.seed) if first_round else explorer(agent, cfg, state["round"])
-        with watch("collect"):
-            data = collect(env, act, seed=_seed(cfg.seed, state["round"]), first_episode=state["episodes"])
-            buffer.extend(data)
+        with watch("wait"):
+            found, ahead = ahead or collector.result(), None
+        data = found.steps.clone(recurse=False)
+        data["episode"] = data["episode"] + state["episodes"]
+        buffer.extend(data)
         state["transitions"] += data.numel()
         state["episodes"] = int(data["episode"].max()) + 1
+        state["unstable"] += found.unstable
+        order = plan_round(state["round"] + 1)
+        if state["transitions"] < cfg.transitions:
+            collector.start(order)
         metrics: dict[str, float] = {"train_success": score(data).success}
         agent.scale_learning_rates(0.5 ** (state["transitions"] / cfg.lr_halves_every))
         agent.hold_value(state["transitions"] <= cfg.hold_value)
@@ -84,8 +100,8 @@ def pretrain(cfg: DictConfig) -> int:
             metrics |= {"success": result.success, "return": result.episode_return}
             state["streak"] = state["streak"] + 1 if result.success >= cfg.target_success else 0
         state["seconds"] = time.monotonic() - began
-        env_log = {"unstable": env.backend.counters["unstable"], "seconds": state["seconds"]}
-        logger.log(state["transitions"], {"updates": state["updates"], **metrics, **env_log})
+        counts = {name: state[name] for name in ("unstable", "seconds")}
+        logger.log(state["transitions"], {"updates": state["updates"], **metrics, **counts})
         bar.update(state["transitions"] - bar.n)
         bar.set_postfix(success=f"{result.success:.0%}" if result else "-", loss=f"{metrics.get('loss', 0):.2f}")
         done = state["streak"] >= cfg.target_streak and state["transitions"] >= cfg.min_transitions
@@ -93,15 +109,17 @@ def pretrain(cfg: DictConfig) -> int:
             with watch("save"):
                 save()
         if stop.asked:
+            collector.close()
             raise Stopped(
                 f"saved after {state['transitions']} transitions. Go on: python -m mpc_sgft.pretrain --resume {folder}"
             )
         if done:
             break
     save()
+    collector.close()
     bar.close()
     final_judge = build.make_env(cfg, cfg.final_episodes, randomised=True)
-    planner = build.make_planner(cfg, env.action_dim)
+    planner = build.make_planner(cfg, judge.action_dim)
     with watch("evaluate"):
         final = score(collect(final_judge, prior(agent), seed=EVAL_SEED + 1))
         planned = score(collect(final_judge, planner_policy(agent.averaged, planner, cfg.seed), seed=EVAL_SEED + 1))
@@ -115,7 +133,7 @@ def pretrain(cfg: DictConfig) -> int:
         "success_interval": [planned.success_low, planned.success_high],
         "prior_success": final.success,
         "return": planned.episode_return,
-        "unstable_episodes": env.backend.counters["unstable"],
+        "unstable_episodes": state["unstable"],
         "wall_seconds": round(time.monotonic() - began, 1),
         "seconds": {part: round(seconds, 1) for part, seconds in watch.spent.items()},
         "checkpoint": str(folder / "checkpoint" / "model.safetensors"),
@@ -143,34 +161,6 @@ def start_agent(cfg: DictConfig, env: ControlEnv) -> Agent:
             "pretrained checkpoints. Give the one that the deployment started from."
         )
     return agent
-
-
-def explorer(agent: Agent, cfg: DictConfig, round_number: int) -> Act:
-    """The policy with its own noise; a share of the environments also makes detours, so that the model sees mistakes.
-
-    A detour holds one action for some steps: none at all, or one drawn uniformly. Without, the critic never learns what
-    it is worth to rest at the goal, because the policy, whose actions are noisy, never rests.
-    """
-    seed, detour = _seed(cfg.seed, round_number), cfg.detours
-    generator = torch.Generator().manual_seed(seed)
-    policy = PolicyPlanner(action_dim=agent.model.action_dim, horizon=1)
-    sample = planner_policy(agent.model, policy, seed, explore=True)
-    roaming = int(detour.share * cfg.num_envs)
-    left = torch.zeros(roaming, dtype=torch.long)  # steps of the detour that are left
-    held = torch.zeros(roaming, policy.action_dim)
-
-    def act(observation: Tensor, fresh: Tensor) -> Tensor:
-        action = sample(observation, fresh)
-        chance, kind = torch.rand(2, roaming, generator=generator)
-        length = torch.randint(detour.steps[0], detour.steps[1], (roaming,), generator=generator)
-        drawn = 2 * torch.rand(roaming, policy.action_dim, generator=generator) - 1
-        starts = (left == 0) & (chance < detour.rate)
-        left[:] = torch.where(starts, length, (left - 1).clamp(min=0))
-        held[starts] = torch.where(kind < detour.rest, 0.0, drawn.T).T[starts]
-        action[:roaming] = torch.where((left > 0)[:, None], held, action[:roaming])
-        return action
-
-    return act
 
 
 def prior(agent: Agent) -> Act:
@@ -202,7 +192,3 @@ class StopRequest:
         self.asked = True
         signal.signal(signal.SIGINT, self._before)
         print(f"\nstopping after this {self.unit}; once more stops at once", flush=True)
-
-
-def _seed(seed: int, round_number: int) -> int:
-    return (seed * 1_000_003 + round_number) % 2**31

@@ -60,8 +60,9 @@ def deployed(pretrained, tmp_path_factory) -> Path:
 
 
 def test_pretraining_resumes_with_the_same_numbers(pretrained, tmp_path):
+    """The whole run had its rounds collected by another process, the resumed one by its own."""
     half = tmp_path / "half"
-    assert run("pretrain", f"run_dir={half}", "transitions=960").returncode == 0
+    assert run("pretrain", f"run_dir={half}", "transitions=960", "collector=inline").returncode == 0
     done = run("pretrain", "--resume", str(half), "transitions=1920")
     assert done.returncode == 0, done.stderr
     whole, resumed = (load_file(f / "checkpoint" / "model.safetensors") for f in (pretrained, half))

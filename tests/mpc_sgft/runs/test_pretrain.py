@@ -9,20 +9,18 @@ from mpc_sgft.command import compose
 from mpc_sgft.command.errors import UserError
 from mpc_sgft.learning.world_model import WorldModel
 from mpc_sgft.runs import build
-from mpc_sgft.runs.pretrain import explorer, start_agent
+from mpc_sgft.runs.collectors import Inline, Process
+from mpc_sgft.runs.explore import Collected, Round, explorer, policy_weights, share
+from mpc_sgft.runs.pretrain import start_agent
 from mpc_sgft.storage import checkpoint
 
 SIZES = dict(obs_dim=6, action_dim=2, decode_dim=3, latent_dim=16, mlp_dim=32, enc_dim=32, num_q=2)
 
 
-class OnlyAModel:
-    model = WorldModel(**SIZES)
-
-
 def test_detours_hold_one_action_in_their_share_of_the_copies():
     detours = {"share": 0.5, "rate": 0.08, "steps": [2, 11], "rest": 0.4}
-    cfg = OmegaConf.create({"seed": 3, "num_envs": 200, "detours": detours})
-    act, observation = explorer(OnlyAModel(), cfg, 0), torch.zeros(200, 6)
+    cfg, model = OmegaConf.create({"detours": detours}), WorldModel(**SIZES)
+    act, observation = explorer(model, cfg, 200, seed=3_000_009), torch.zeros(200, 6)
     actions = torch.stack([act(observation, torch.full((200,), t == 0)) for t in range(400)])  # [T, N, A]
     same = (actions[1:] == actions[:-1]).all(-1)  # the policy's own noise never repeats
     assert not same[:, 100:].any()
@@ -32,7 +30,7 @@ def test_detours_hold_one_action_in_their_share_of_the_copies():
     moving = same[50:, :100] & ~rests[51:, :100]
     assert abs(moving.float().mean() - 0.6 * 5 / (6 + 1 / 0.08)) < 0.02  # of n equal steps n - 1 repeat
     assert actions.abs().max() <= 1
-    again = explorer(OnlyAModel(), cfg, 0)
+    again = explorer(model, cfg, 200, seed=3_000_009)
     assert torch.equal(again(observation, torch.ones(200, dtype=torch.bool)), actions[0])
 
 
@@ -84,3 +82,57 @@ def test_found_effects_and_draws_combine():
     latency = env.backend.batch.expand("actuator_delay")[:, 0]
     assert (latency >= 0.3).all() and (latency <= 0.45).all() and len(set(latency)) == 8
     assert env.backend.model.body("payload_puck").mass[0] == 0.5
+
+
+def test_the_shares_of_the_workers_make_up_all_environments():
+    for count, parts in ((64, 1), (10, 3), (3, 3)):
+        shares = [share(count, part, parts) for part in range(parts)]
+        assert sum(shares) == count and max(shares) - min(shares) <= 1
+
+
+@pytest.mark.parametrize("at_random", [True, False])
+def test_a_process_collects_what_this_one_would(at_random):
+    """A round is a function of its number and of the policy, and survives being written down."""
+    cfg = config(num_envs=3)
+    agent = build.make_agent(cfg, build.make_env(cfg, 1))
+    order = Round(5, None if at_random else policy_weights(agent.model))
+    found = []
+    for collector in (Inline(cfg, agent.model.sizes), Process(cfg, agent.model.sizes)):
+        collector.start(order)
+        found.append(collector.result())
+        collector.close()
+    found.append(Collected.of(found[1].state_dict()))
+    for other in found[1:]:
+        assert (found[0].steps == other.steps).all() and other.unstable == 0
+    assert found[0].steps.shape == (3, build.make_env(cfg, 1).task.episode_steps)
+
+
+def test_two_workers_number_their_episodes_one_after_the_other():
+    cfg = config(num_envs=5)
+    agent = build.make_agent(cfg, build.make_env(cfg, 1))
+    collector = Process(cfg, agent.model.sizes, workers=2)
+    collector.start(Round(0, None))
+    steps = collector.result().steps
+    collector.close()
+    firsts = steps["episode"][:, 0].tolist()
+    assert len(steps) == 5 and firsts == sorted(set(firsts)) and firsts[0] == 0
+    starts = steps["observation"][:, 0]
+    assert torch.unique(starts, dim=0).shape == starts.shape  # no two environments share their random numbers
+
+
+def test_a_collecting_process_that_dies_is_named():
+    cfg = config(num_envs=2)
+    collector = Process(cfg, build.make_agent(cfg, build.make_env(cfg, 1)).model.sizes)
+    collector.start(Round(0, None))
+    collector.result()
+    for process in collector._pools[0]._processes.values():
+        process.kill()
+        process.join()
+    with pytest.raises(UserError, match="a collecting process ended.*--resume"):
+        collector.start(Round(1, None))
+        collector.result()
+
+
+def test_more_workers_than_environments_are_refused():
+    with pytest.raises(UserError, match="collector.workers=3: between 1 and num_envs=2"):
+        Process(config(num_envs=2), SIZES, workers=3)

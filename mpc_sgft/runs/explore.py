@@ -1,0 +1,119 @@
+"""A round of exploration in simulation, as a function of its number and of the policy: the same wherever it runs."""
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import torch
+from omegaconf import DictConfig
+from tensordict import TensorDict
+from torch import Tensor
+
+from mpc_sgft.learning.world_model import WorldModel
+from mpc_sgft.runs import build
+from mpc_sgft.runs.collect import Act, collect, planner_policy, random_policy
+from planners.policy import PolicyPlanner
+
+POLICY = ("normalizer", "encoder", "policy_head")  # what acting takes of the model
+
+
+class Round(NamedTuple):
+    """What a worker must know to collect one round: one episode's length in every environment."""
+
+    number: int
+    weights: dict[str, Tensor] | None  # of the parts in POLICY; None: uniform random actions
+
+
+class Collected(NamedTuple):
+    """What came of a round."""
+
+    steps: TensorDict  # [N, T], episodes numbered from 0
+    unstable: int  # episodes that the simulator had to give up
+
+    def state_dict(self) -> dict[str, Any]:
+        """As nested dicts of tensors and numbers, for `Collected.of`."""
+        flat = self.steps.flatten_keys(".")
+        return {"steps": {str(k): v for k, v in flat.items()}, "size": tuple(flat.shape), "unstable": self.unstable}
+
+    @classmethod
+    def of(cls, state: Mapping[str, Any]) -> "Collected":
+        """What `state_dict` wrote down."""
+        return cls(TensorDict(state["steps"], state["size"]).unflatten_keys("."), state["unstable"])
+
+
+def policy_weights(model: WorldModel) -> dict[str, Tensor]:
+    """Copies of what acting takes of a model, on the CPU."""
+    return {name: x.detach().cpu().clone() for name, x in model.state_dict().items() if name.split(".")[0] in POLICY}
+
+
+class Explorer:
+    """One worker's environments and policy.
+
+    Args:
+        cfg: The run's config.
+        sizes: Of the world model.
+        part, parts: Which share of the environments is this worker's; each share has its own random numbers.
+    """
+
+    def __init__(self, cfg: DictConfig, sizes: dict, part: int = 0, parts: int = 1) -> None:
+        self.cfg, self.part, self.parts = cfg, part, parts
+        with torch.random.fork_rng(devices=[]):  # the learner's own random numbers may be in this process
+            self.model = WorldModel(**sizes).eval()
+        self.env = build.make_env(cfg, share(cfg.num_envs, part, parts), randomised=True, learning=True)
+
+    def collect(self, order: Round) -> Collected:
+        """Collect this worker's share of a round."""
+        before = self.env.backend.counters["unstable"]
+        seed = round_seed(self.cfg.seed, order.number * self.parts + self.part)
+        if order.weights is None:
+            act = random_policy(self.env, seed)
+        else:
+            self.model.load_state_dict(order.weights, strict=False)
+            act = explorer(self.model, self.cfg, self.env.batch_size[0], seed)
+        steps = collect(self.env, act, seed=seed)
+        return Collected(steps, self.env.backend.counters["unstable"] - before)
+
+
+def share(count: int, part: int, parts: int) -> int:
+    """How many of `count` environments the worker `part` has; the first ones take what is left over."""
+    return count // parts + (part < count % parts)
+
+
+def joined(collected: list[Collected]) -> Collected:
+    """The shares of a round together, their episodes numbered one after the other."""
+    following = 0
+    for steps, _ in collected:
+        steps["episode"] += following
+        following = int(steps["episode"].max()) + 1
+    return Collected(torch.cat([c.steps for c in collected]), sum(c.unstable for c in collected))
+
+
+def explorer(model: WorldModel, cfg: DictConfig, num_envs: int, seed: int) -> Act:
+    """The policy with its own noise; a share of the environments also makes detours, so that the model sees mistakes.
+
+    A detour holds one action for some steps: none at all, or one drawn uniformly. Without, the critic never learns what
+    it is worth to rest at the goal, because the policy, whose actions are noisy, never rests.
+    """
+    detour = cfg.detours
+    generator = torch.Generator().manual_seed(seed)
+    policy = PolicyPlanner(action_dim=model.action_dim, horizon=1)
+    sample = planner_policy(model, policy, seed, explore=True)
+    roaming = int(detour.share * num_envs)
+    left = torch.zeros(roaming, dtype=torch.long)  # steps of the detour that are left
+    held = torch.zeros(roaming, policy.action_dim)
+
+    def act(observation: Tensor, fresh: Tensor) -> Tensor:
+        action = sample(observation, fresh)
+        chance, kind = torch.rand(2, roaming, generator=generator)
+        length = torch.randint(detour.steps[0], detour.steps[1], (roaming,), generator=generator)
+        drawn = 2 * torch.rand(roaming, policy.action_dim, generator=generator) - 1
+        starts = (left == 0) & (chance < detour.rate)
+        left[:] = torch.where(starts, length, (left - 1).clamp(min=0))
+        held[starts] = torch.where(kind < detour.rest, 0.0, drawn.T).T[starts]
+        action[:roaming] = torch.where((left > 0)[:, None], held, action[:roaming])
+        return action
+
+    return act
+
+
+def round_seed(seed: int, number: int) -> int:
+    return (seed * 1_000_003 + number) % 2**31
