@@ -18,6 +18,7 @@ NEEDS = {  # what a test may need, and what brings it
     "the robot's client": "make robot",
     "the camera's packages": "make system setup",
     "wandb": "make setup",
+    "Ray": "make setup",
     "Linux": "a Linux machine",
     "measured data": "MPC_SGFT_DATA=FOLDER",
     "lerobot's environment": "python -m tools.export_lerobot",

@@ -1,0 +1,123 @@
+"""Rounds of pretraining collected on a Ray cluster: on this machine, or on many.
+
+Ray's own fault tolerance does the rest: a worker that dies is started again, and repeats its share of the round. A
+share is a function of its number and of the policy, so that the numbers are the same as if nothing had happened.
+TorchRL's RayCollector is not used because it ends the run when a worker dies.
+"""
+
+import logging
+import pickle
+import platform
+import socket
+from importlib.metadata import version
+
+import torch
+from omegaconf import DictConfig
+
+from mpc_sgft.command.errors import UserError
+from mpc_sgft.runs.collectors import AbstractCollector
+from mpc_sgft.runs.explore import Collected, Explorer, Round, joined
+
+ANSWER = 10.0  # [s] within which a cluster must accept a connection
+STORE = 256 * 2**20  # bytes of shared memory of a cluster that is started here
+MUST_AGREE = ("mpc_sgft", "torch", "mujoco")
+
+
+class Ray(AbstractCollector):
+    """Workers of a Ray cluster, each with its share of the environments, while this process learns.
+
+    Args:
+        cfg, sizes: As `Explorer`.
+        workers: How many.
+        address: `host:port` or `auto` of a cluster to join; None starts one here and stops it at the end.
+
+    Raises:
+        UserError: If Ray is not installed, nobody answers at the address, or a worker has other versions.
+    """
+
+    def __init__(self, cfg: DictConfig, sizes: dict, workers: int, address: str | None = None) -> None:
+        try:
+            import ray
+        except ModuleNotFoundError as error:
+            raise UserError("collector=ray needs Ray: pip install 'mpc_sgft[ray]'") from error
+        if not 1 <= workers <= cfg.num_envs:
+            raise UserError(f"collector.workers={workers}: between 1 and num_envs={cfg.num_envs}.")
+        if address is not None and address != "auto":
+            _check_answers(address)
+        here = {"num_cpus": workers, "include_dashboard": False, "object_store_memory": STORE}
+        try:
+            ray.init(
+                address=address or "local",
+                configure_logging=True,
+                logging_level=logging.ERROR,
+                log_to_driver=False,
+                **({} if address else here),
+            )
+        except (ConnectionError, RuntimeError, ValueError) as error:
+            text = " ".join(str(error).split())
+            raise UserError(f"collector.address={address}: Ray could not join that cluster. {text}") from error
+        self._ray, self._found = ray, None
+        actor = ray.remote(num_cpus=1, max_restarts=-1, max_task_retries=-1)(_Worker)
+        blobs = [pickle.dumps((cfg, sizes, part, workers)) for part in range(workers)]
+        self._workers = [actor.remote(blob) for blob in blobs]
+        self._check_versions()
+
+    def start(self, order: Round) -> None:
+        blob, self._found = self._ray.put(pickle.dumps(order)), None
+        self._coming = [worker.collect.remote(blob) for worker in self._workers]
+
+    def result(self) -> Collected:
+        if self._found is None:
+            try:
+                self._found = joined([pickle.loads(blob) for blob in self._ray.get(self._coming)])
+            except self._ray.exceptions.RayError as error:
+                raise UserError(
+                    f"the Ray cluster gave up: {' '.join(str(error).split())[:300]}. What was saved is there: go on "
+                    "with --resume RUN_FOLDER."
+                ) from error
+        return self._found
+
+    def close(self) -> None:
+        for worker in self._workers:
+            self._ray.kill(worker)
+        self._ray.shutdown()
+
+    def _check_versions(self) -> None:
+        ours = versions()
+        for name, theirs in self._ray.get([worker.versions.remote() for worker in self._workers]):
+            if theirs != ours:
+                self.close()
+                raise UserError(f"the worker on {name} has {theirs}, this process {ours}: install the same there.")
+
+
+def versions() -> dict[str, str]:
+    """Versions that must be the same wherever rounds are collected."""
+    return {name: version(name) for name in MUST_AGREE}
+
+
+class _Worker:
+    """What runs on the cluster."""
+
+    def __init__(self, blob: bytes) -> None:
+        torch.set_num_threads(1)
+        self._explorer = Explorer(*pickle.loads(blob))
+
+    def versions(self) -> tuple[str, dict[str, str]]:
+        return platform.node(), versions()
+
+    def collect(self, blob: bytes) -> bytes:
+        return pickle.dumps(self._explorer.collect(pickle.loads(blob)))
+
+
+def _check_answers(address: str) -> None:
+    """Raise UserError unless something accepts connections there; Ray itself would try for a minute."""
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    if not host or not port.isdigit():
+        raise UserError(f"collector.address={address}: host:port, ray://host:port or auto.")
+    try:
+        socket.create_connection((host, int(port)), timeout=ANSWER).close()
+    except OSError as error:
+        raise UserError(
+            f"collector.address={address}: nobody answers ({error}). Start a cluster there with ray start --head, or "
+            "leave the address out to start one here."
+        ) from error

@@ -1,0 +1,99 @@
+"""Rounds on a real local Ray cluster: the same numbers, workers that are killed, and nothing left behind."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import psutil
+import pytest
+
+from mpc_sgft.command import compose
+from mpc_sgft.command.errors import UserError
+from mpc_sgft.runs import build, ray_collector
+from mpc_sgft.runs.explore import Collected, Explorer, Round, joined, policy_weights
+from mpc_sgft.runs.ray_collector import Ray
+
+pytest.importorskip("ray", reason="needs Ray")
+CFG = compose.compose("pretrain", ["task=pendulum", "+experiment=debug", "num_envs=5", "device=cpu"], [])
+
+
+def workers_of(parent: psutil.Process) -> list[psutil.Process]:
+    return [p for p in parent.children(recursive=True) if p.name().startswith("ray::_Worker")]
+
+
+@pytest.fixture(scope="module")
+def agent():
+    return build.make_agent(CFG, build.make_env(CFG, 1))
+
+
+@pytest.fixture(scope="module")
+def cluster(agent) -> Iterator[Ray]:
+    collector = Ray(CFG, agent.model.sizes, workers=2)
+    yield collector
+    collector.close()
+    assert not workers_of(psutil.Process())
+
+
+@pytest.fixture(scope="module")
+def expected(agent) -> Collected:
+    order = Round(3, policy_weights(agent.model))
+    return joined([Explorer(CFG, agent.model.sizes, part, 2).collect(order) for part in range(2)])
+
+
+def test_a_cluster_collects_what_this_process_would(agent, cluster, expected) -> None:
+    cluster.start(Round(3, policy_weights(agent.model)))
+    assert (cluster.result().steps == expected.steps).all() and len(expected.steps) == 5
+    assert cluster.result() is cluster.result()
+
+
+def test_a_killed_worker_costs_its_share_and_nothing_else(agent, cluster, expected) -> None:
+    victim = workers_of(psutil.Process())[0]
+    cluster.start(Round(3, policy_weights(agent.model)))
+    victim.kill()
+    assert (cluster.result().steps == expected.steps).all()
+    assert victim.pid not in {p.pid for p in workers_of(psutil.Process())}
+
+
+def test_an_address_that_nobody_answers_is_one_line_soon(agent) -> None:
+    with socket.socket() as taken:  # bound, not listening
+        taken.bind(("127.0.0.1", 0))
+        began = time.monotonic()
+        with pytest.raises(UserError, match=r"collector.address=127.0.0.1:\d+: nobody answers") as found:
+            Ray(CFG, agent.model.sizes, workers=1, address=f"127.0.0.1:{taken.getsockname()[1]}")
+    assert time.monotonic() - began < 15 and "\n" not in str(found.value)
+
+
+def test_what_is_no_address_is_refused(agent) -> None:
+    with pytest.raises(UserError, match="collector.address=somewhere: host:port"):
+        Ray(CFG, agent.model.sizes, workers=1, address="somewhere")
+
+
+def test_a_worker_of_another_version_is_named(cluster, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ray_collector, "versions", lambda: {"mpc_sgft": "9.9"})
+    monkeypatch.setattr(cluster, "close", lambda: None)  # the other tests go on with it
+    with pytest.raises(UserError, match="the worker on .* has .*'mpc_sgft': '0.* this process .*9.9"):
+        cluster._check_versions()
+
+
+def test_ctrl_c_leaves_no_process_behind(tmp_path: Path) -> None:
+    words = ["task=pendulum", "+experiment=debug", "collector=ray", "transitions=1000000", f"run_dir={tmp_path / 'r'}"]
+    line = [sys.executable, "-m", "mpc_sgft.pretrain", "--quiet", *words, "log.tensorboard=false"]
+    run = subprocess.Popen(line, stderr=subprocess.PIPE, text=True, env=os.environ | {"OMP_NUM_THREADS": "1"})
+    metrics, deadline = tmp_path / "r" / "metrics.csv", time.monotonic() + 120
+    while not (metrics.exists() and len(metrics.read_text().splitlines()) > 2):
+        assert time.monotonic() < deadline and run.poll() is None
+        time.sleep(0.2)
+    family = psutil.Process(run.pid).children(recursive=True)
+    assert any(p.name().startswith("ray::_Worker") for p in family)
+    run.send_signal(signal.SIGINT)
+    _, error = run.communicate(timeout=60)
+    assert run.returncode == 130 and "Go on: python -m mpc_sgft.pretrain --resume" in error
+    _, alive = psutil.wait_procs(family, timeout=20)
+    assert not alive
