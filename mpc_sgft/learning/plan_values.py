@@ -135,7 +135,7 @@ class PlanValues:
         return simnorm(logits, dynamics.simnorm_dim)
 
     def _first(self, name: str, on_code: dict[str, Tensor], rest: Tensor) -> Tensor:
-        return torch.addmm(on_code[name], rest, self.weights.heads[name].on_rest)
+        return on_code[name].addmm_(rest, self.weights.heads[name].on_rest)  # asked for once
 
     def _rewards(self, first: list[Tensor]) -> Tensor:
         """Rewards [H, n] from the first products of every step, as many steps at a time as fit the cache."""

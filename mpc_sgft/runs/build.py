@@ -37,7 +37,9 @@ def prepare_process(cfg: DictConfig) -> None:
     logging.getLogger("torchrl").setLevel(logging.WARNING)  # it announces every buffer it creates
 
 
-def make_env(cfg: DictConfig, num_envs: int, *, randomised: bool = False, learning: bool = False) -> ControlEnv:
+def make_env(
+    cfg: DictConfig, num_envs: int, *, randomised: bool = False, learning: bool = False, threads: int = 0
+) -> ControlEnv:
     """The task in simulation with the effects of `cfg.gap`.
 
     Args:
@@ -45,6 +47,7 @@ def make_env(cfg: DictConfig, num_envs: int, *, randomised: bool = False, learni
         num_envs: Copies stepped side by side [N].
         randomised: Each episode draws its own model.
         learning: The episodes are learned from, not measured: they start as `cfg.task.in_training` says.
+        threads: Of the physics; 0 takes all cores.
 
     Raises:
         UserError: For an unknown effect, a parameter out of bounds, or a draw that names nothing.
@@ -61,7 +64,7 @@ def make_env(cfg: DictConfig, num_envs: int, *, randomised: bool = False, learni
             draws = randomize.load(OmegaConf.to_container(cfg.randomize.draws, resolve=True))  # type: ignore[arg-type]
             noise = {"noise_sd": cfg.randomize.noise_sd, "noise_probability": cfg.randomize.noise_probability}
     with from_config("gap"):
-        backend = SimBackend(task, num_envs, effects=present, draws=draws, **noise)
+        backend = SimBackend(task, num_envs, effects=present, draws=draws, threads=threads, **noise)
     return ControlEnv(backend, history=cfg.task.history)
 
 

@@ -110,7 +110,7 @@ def _begin(blob: bytes) -> None:
     global _explorer
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     torch.set_num_threads(1)
-    _explorer = Explorer(*pickle.loads(blob))
+    _explorer = Explorer(*pickle.loads(blob), threads=1)
 
 
 def _collect(blob: bytes) -> bytes:

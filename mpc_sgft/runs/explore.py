@@ -52,13 +52,15 @@ class Explorer:
         cfg: The run's config.
         sizes: Of the world model.
         part, parts: Which share of the environments is this worker's; each share has its own random numbers.
+        threads: Of the physics; 0 takes all cores. They do not change the numbers.
     """
 
-    def __init__(self, cfg: DictConfig, sizes: dict, part: int = 0, parts: int = 1) -> None:
+    def __init__(self, cfg: DictConfig, sizes: dict, part: int = 0, parts: int = 1, threads: int = 0) -> None:
         self.cfg, self.part, self.parts = cfg, part, parts
         with torch.random.fork_rng(devices=[]):  # the learner's own random numbers may be in this process
             self.model = WorldModel(**sizes).eval()
-        self.env = build.make_env(cfg, share(cfg.num_envs, part, parts), randomised=True, learning=True)
+        count = share(cfg.num_envs, part, parts)
+        self.env = build.make_env(cfg, count, randomised=True, learning=True, threads=threads)
 
     def collect(self, order: Round) -> Collected:
         """Collect this worker's share of a round."""

@@ -100,7 +100,7 @@ class _Worker:
 
     def __init__(self, blob: bytes) -> None:
         torch.set_num_threads(1)
-        self._explorer = Explorer(*pickle.loads(blob))
+        self._explorer = Explorer(*pickle.loads(blob), threads=1)
 
     def versions(self) -> tuple[str, dict[str, str]]:
         return platform.node(), versions()
