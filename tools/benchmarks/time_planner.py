@@ -5,11 +5,12 @@
 Everything is measured in this process. `share` is the arithmetic of all linear layers, divided by the best time and by
 the fp32 peak beside it, measured before and after the row. `cpu_ms` is processor time: on one thread it is what a quiet
 machine would take, and where it is far below the median the machine was busy. Two threads on busy cores wait for each
-other, and say nothing then. Upstream's figures were measured once, on cores of 120 GFLOP/s each (235 for two).
+other, and say nothing then. Upstream's figures were measured once, on cores of 95 GFLOP/s.
 """
 
 import argparse
 import csv
+import itertools
 import os
 import platform
 import sys
@@ -27,6 +28,7 @@ from tensordict import TensorDict
 from mpc_sgft.learning.agent import Agent
 from mpc_sgft.learning.world_model import WorldModel
 from mpc_sgft.runs.collect import planner_policy
+from planners.base import PRECISIONS
 from planners.malloc import keep_freed_memory
 from planners.mppi import MPPI
 
@@ -35,12 +37,10 @@ SPACES = {"small": (22, 2)}  # entries of observation and action: push with its 
 UPSTREAM = (12, 3)
 SEARCH = {"num_candidates": 512, "num_prior": 24, "num_elites": 64, "iterations": 6}  # upstream's, for every size
 BATCH = 256  # slices of an update
-UPSTREAM_PEAK = {1: 120.0, 2: 235.0}  # GFLOP/s of the cores on which upstream was measured, by threads
-UPSTREAM_MS = {  # eager, CPU, (what, size, horizon, threads); where only a range is known, its fast end
-    ("plan", "1M", 3, 2): 115, ("plan", "1M", 4, 2): 147, ("plan", "5M", 3, 2): 346, ("plan", "5M", 4, 2): 410,
-    ("plan", "1M", 4, 1): 268, ("plan", "5M", 4, 1): 742,
-    ("update", "1M", 3, 2): 105, ("update", "1M", 4, 2): 137, ("update", "5M", 3, 2): 374, ("update", "5M", 4, 2): 445,
-    ("update", "1M", 3, 1): 162, ("update", "1M", 4, 1): 162, ("update", "5M", 3, 1): 600, ("update", "5M", 4, 1): 600,
+UPSTREAM_PEAK = {1: 95.0, 2: 190.0}  # GFLOP/s in fp32 of the cores on which upstream was measured, by threads
+UPSTREAM_MS = {  # eager fp32 on a quiet AMD EPYC with AVX-512-BF16, (what, size, horizon, threads)
+    ("plan", "1M", 4, 1): 375, ("plan", "5M", 4, 1): 959, ("plan", "1M", 4, 2): 200,
+    ("update", "1M", 3, 1): 224, ("update", "5M", 3, 1): 788, ("update", "5M", 3, 2): 450,
 }  # fmt: skip
 
 
@@ -65,10 +65,15 @@ def head_flop(model: WorldModel) -> dict[str, int]:
 
 
 def plan_flop(model: WorldModel, planner: MPPI) -> int:
-    """Arithmetic of one plan: every candidate H steps and its V; those of the prior also ask the policy, once."""
+    """Arithmetic of one plan: every candidate H steps and its V; those of the prior also ask the policy, once.
+
+    The first product of the dynamics on the latent that all candidates start from is not repeated for them.
+    """
     f, p = head_flop(model), planner
-    rows = p.iterations * (p.num_candidates - p.num_prior) + p.num_prior + 1
-    return rows * (p.horizon * (f["next"] + f["reward"]) + f["value"]) + p.num_prior * p.horizon * f["policy"]
+    drawn = p.iterations * (p.num_candidates - p.num_prior)
+    all_heads = (drawn + p.num_prior + 1) * (p.horizon * (f["next"] + f["reward"]) + f["value"])
+    shared = drawn * mlp_flop(int(model.sizes["latent_dim"]), int(model.sizes["mlp_dim"]))
+    return all_heads - shared + p.num_prior * p.horizon * f["policy"]
 
 
 def update_flop(model: WorldModel, steps: int) -> int:
@@ -109,16 +114,16 @@ def random_batch(obs_dim: int, action_dim: int, steps: int) -> TensorDict:
     return TensorDict({**now, "next": TensorDict(following, shape)}, shape)
 
 
-def jobs(size: str, many: bool) -> list[tuple[str, int, int, int, Callable[[], object]]]:
+def jobs(size: str, precision: str, many: bool) -> list[tuple[str, int, int, int, Callable[[], object]]]:
     """(what, horizon, rows, flop, call) of everything timed for one model size; `many` plans 100 environments too."""
     obs_dim, action_dim = SPACES.get(size, UPSTREAM)
     sizes = {"obs_dim": obs_dim, "action_dim": action_dim, "decode_dim": min(obs_dim, 12)}
     model: WorldModel = instantiate(OmegaConf.load(ROOT / f"configs/model/{size}.yaml"), **sizes)
     train = OmegaConf.load(ROOT / "configs/train/default.yaml")
-    agent: Agent = instantiate(train.agent, model=model, discount=0.99)
+    agent: Agent = instantiate(train.agent, model=model, discount=0.99, precision=precision)
     out: list[tuple[str, int, int, int, Callable[[], object]]] = []
     for horizon in (3, 4):
-        planner = MPPI(action_dim=action_dim, horizon=horizon, **SEARCH)
+        planner = MPPI(action_dim=action_dim, horizon=horizon, precision=precision, **SEARCH)
         for envs in (1, 100) if many and size == "small" and horizon == 4 else (1,):
             act, fresh = planner_policy(model, planner, seed=0), torch.ones(envs, dtype=torch.bool)
             act = partial(act, torch.randn(envs, obs_dim), fresh)
@@ -136,22 +141,24 @@ def cpu_name() -> str:
     return names[0] if names else platform.processor() or platform.machine()
 
 
-def measure(sizes: list[str], threads: list[int], repeats: int, malloc: str) -> list[dict[str, object]]:
+def measure(
+    sizes: list[str], threads: list[int], precisions: list[str], repeats: int, malloc: str
+) -> list[dict[str, object]]:
     """One row for each size, thread count and job, printed as it comes."""
     machine = {"cpu": cpu_name(), "cores": os.cpu_count(), "torch": torch.__version__, "malloc": malloc}
-    print(f"{machine['cpu']}, {machine['cores']} cores, torch {machine['torch']}, malloc {malloc}, fp32")
-    heads = "what size H rows threads median_ms best_ms cpu_ms peak share upstream ratio".split()
+    print(f"{machine['cpu']}, {machine['cores']} cores, torch {machine['torch']}, malloc {malloc}")
+    heads = "what size H precision rows threads median_ms best_ms cpu_ms peak share upstream ratio".split()
     print("".join(f"{head:>10}" for head in heads))
     rows = []
     for count in threads:
         torch.set_num_threads(count)
-        for size in sizes:
-            for what, horizon, batch, flop, call in jobs(size, many=repeats > 3):
+        for size, precision in itertools.product(sizes, precisions):
+            for what, horizon, batch, flop, call in jobs(size, precision, many=repeats > 3):
                 before = peak_gflops(repeats)
                 wall, cpu = seconds(call, repeats if batch != 100 else max(2, repeats // 5))
                 peak = max(before, peak_gflops(repeats))
                 theirs = UPSTREAM_MS.get((what, size, horizon, count))
-                row: dict[str, object] = {"what": what, "size": size, "horizon": horizon}
+                row: dict[str, object] = {"what": what, "size": size, "horizon": horizon, "precision": precision}
                 row |= {"rows": batch, "threads": count}
                 row |= {"median_ms": round(median(wall) * 1e3, 1), "best_ms": round(min(wall) * 1e3, 1)}
                 row |= {"cpu_ms": round(median(cpu) * 1e3, 1), "peak_gflops": round(peak, 1)}
@@ -170,11 +177,12 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--quick", action="store_true", help="3 repeats instead of 20, one environment")
     parser.add_argument("--sizes", nargs="+", default=["small", "1M", "5M"], choices=known)
     parser.add_argument("--threads", nargs="+", type=int, default=[1, 2], choices=(1, 2))
+    parser.add_argument("--precisions", nargs="+", default=["float32", "bfloat16"], choices=PRECISIONS)
     parser.add_argument("--default-malloc", action="store_true", help="without planners.malloc.keep_freed_memory()")
     parser.add_argument("--out", type=Path, default=ROOT / "results/timing/time_planner.csv")
     args = parser.parse_args(arguments)
     malloc = "default" if args.default_malloc or not keep_freed_memory() else "kept"
-    rows = measure(args.sizes, args.threads, 3 if args.quick else 20, malloc)
+    rows = measure(args.sizes, args.threads, args.precisions, 3 if args.quick else 20, malloc)
     args.out.parent.mkdir(parents=True, exist_ok=True)
     with args.out.open("w", newline="") as file:
         writer = csv.DictWriter(file, rows[0])

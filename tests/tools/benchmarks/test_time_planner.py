@@ -39,7 +39,7 @@ def test_measures_and_writes(
 ) -> None:
     monkeypatch.setattr(time_planner, "keep_freed_memory", lambda: False)  # this process is not ours to change
     out = tmp_path / "deeper" / "t.csv"
-    assert main(["--quick", "--sizes", "small", "--threads", "1", "--out", str(out)]) == 0
+    assert main(["--quick", "--sizes", "small", "--threads", "1", "--precisions", "float32", "--out", str(out)]) == 0
     rows = list(csv.DictReader(out.open()))
     assert [(row["what"], row["horizon"], row["rows"]) for row in rows] == [
         ("plan", "3", "1"), ("update", "3", "256"), ("plan", "4", "1"), ("update", "4", "256"),
