@@ -26,7 +26,9 @@ def on_pre_build(config: Any) -> None:
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
     """Fill the places that are marked {{ so }}."""
-    for name, fill in (("results", results_page.page), ("settings", settings), ("effects", effects)):
+    fills = {"results": results_page.page, "ablation": results_page.STUDIES["ablation"]}
+    fills |= {"collect": results_page.collect, "thousand": results_page.thousand, "settings": settings}
+    for name, fill in {**fills, "effects": effects}.items():
         mark = "{{ " + name + " }}"
         if mark in markdown:
             markdown = markdown.replace(mark, fill())

@@ -89,6 +89,12 @@ def transfer() -> str:
     return curves(rows, lambda r: f"`{r['gap']}`, {r['method']}", "gap and method")
 
 
+def left_out(row: Row) -> str:
+    """The gap of a row and what its variant leaves out."""
+    changes = [change.split("=")[0].split(".")[-1] for change in row["variant"].split()]
+    return f"`{row['gap']}`: " + ("nothing" if not changes else "all of these" if len(changes) > 1 else changes[0])
+
+
 def blind() -> str:
     rows = [r for r in read("blind/blind.csv") if r["method"] == "diagnose"]
     lines = [[r["score"], r["goal"], f"{percent(r['value'])} [{percent(r['low'])}, {percent(r['high'])}]", r["of"]]
@@ -114,12 +120,11 @@ def loop() -> str:
     parts = [pick(read("close_the_loop/close_the_loop.csv"), head)]
     for file, says in (("diagnose_run", "What was named"), ("diagnose_run_again", "With the later solver")):
         parts.append(f"{says}:\n\n{pick(read(f'close_the_loop/{file}.csv'), named)}")
-    dev = {name: name for name in ("gap", "imagined_steps", "hold_value", "transitions", "zero_shot_success")}
-    return "\n\n".join([*parts, f"Ways to retrain:\n\n{pick(read('close_the_loop/retrain_dev.csv'), dev)}"])
+    return "\n\n".join(parts)
 
 
 def timing() -> str:
-    plan = {name: name for name in ("what", "size", "horizon", "rows", "threads")}
+    plan = {name: name for name in ("what", "size", "precision", "horizon", "rows", "threads")}
     plan = {**plan, "median ms": "median_ms", "share of peak": "share_of_peak", "to upstream": "ratio_to_upstream"}
     diagnose = {"what": "what", "s of data": "seconds_of_data", "names": "names", "wall s": "wall_s", "per unit": "per"}
     env = {"what": "what", "physics steps / s": "physics_steps_per_s", "ControlEnv / this": "control_env_over_this"}
@@ -136,6 +141,37 @@ def records(*paths: str) -> str:
     plain = [k for k in keys if not any(isinstance(d.get(k), dict | list) and d.get(k) for d in flat)]
     names = [Path(path).stem for path in paths]
     return table(["", *names], [[k, *(d.get(k, "") if d.get(k) is not None else "" for d in flat)] for k in plain])
+
+
+def collect() -> str:
+    head = {name: name for name in ("collector", "workers")}
+    head |= {"start [s]": "start_s", "transitions / s": "steps_per_s", "to inline": "to_inline"}
+    return pick(read("scale/time_collect.csv"), {**head, "bytes a transition": "bytes_per_step"})
+
+
+def updates_per_s() -> float:
+    """Updates of the small model on one thread, of as many slices as time_planner takes."""
+    wanted = {"what": "update", "size": "small", "horizon": "3", "precision": "float32", "threads": "1"}
+    row = next(r for r in read("timing/time_planner.csv") if wanted.items() <= r.items())
+    return 1000 / float(row["median_ms"])
+
+
+def thousand() -> str:
+    """What a thousand workers would send and receive, by the arithmetic of one."""
+    one = next(r for r in read("scale/time_collect.csv") if (r["collector"], r["workers"]) == ("process", "1"))
+    rate, size, weights = (float(one[name]) for name in ("steps_per_s", "bytes_per_step", "weights_bytes"))
+    round_s = float(one["median_s"])
+    rows = [
+        ["transitions a second", f"{1000 * rate:.3g}"],
+        ["to the learner", f"{1000 * rate * size / 1e6:.0f} MB/s"],
+        ["weights to the workers", f"{1000 * weights / 1e6:.0f} MB a round, {1000 * weights / round_s / 1e6:.0f} MB/s"],
+        [
+            "updates a second that 0.05 a transition asks for",
+            f"{1000 * rate * 0.05:.3g}; by one worker {rate * 0.05:.3g}",
+        ],
+        ["updates a second of 256 slices that one core makes", f"{updates_per_s():.2g}"],
+    ]
+    return table(["1 000 workers", ""], rows)
 
 
 def emps() -> str:
@@ -156,7 +192,7 @@ def exact() -> str:
 STUDIES: dict[str, Callable[[], str]] = {
     "pretrain": pretrain,
     "transfer": transfer,
-    "no_harm": lambda: curves(read("no_harm/no_harm.csv"), lambda r: r["variant"] or "all of it", "variant"),
+    "ablation": lambda: curves(read("ablation/ablation.csv"), left_out, "gap, and what is left out"),
     "horizon": lambda: curves(read("horizon/horizon.csv"), lambda r: r["variant"], "variant"),
     "pendulum": lambda: curves(read("pendulum/pendulum.csv"), lambda r: r["method"], "method"),
     "critic_profile": critic,
@@ -169,6 +205,7 @@ STUDIES: dict[str, Callable[[], str]] = {
     "franka_sim": lambda: records("franka_sim/franka_sim.json"),
     "stability": lambda: records("stability/stability.json"),
     "timing": timing,
+    "scale": collect,
 }
 
 

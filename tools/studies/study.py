@@ -1,7 +1,7 @@
 """Run many deployments, side by side and resumable, and collect their learning curves into one CSV.
 
     python -m tools.studies.study results/transfer/sgft.csv --gaps turned sluggish skate --seeds 0 1 2 3 4
-    python -m tools.studies.study results/horizon/horizon.csv --gaps sluggish --variants horizon=1 horizon=2
+    python -m tools.studies.study results/horizon/horizon.csv --gaps sluggish --variants horizon=1 "horizon=2 gamma=0.9"
 
 Each run is `python -m mpc_sgft.deploy` in a process of its own with one thread; its folder is kept under --runs, and a
 run whose summary is there is not repeated. With several --checkpoints, seed s uses number s modulo their count.
@@ -26,7 +26,9 @@ def main() -> None:
     parser.add_argument(
         "--checkpoints", nargs="+", default=[None], help="run folders or files; default: the shipped one"
     )
-    parser.add_argument("--variants", nargs="+", default=[""], metavar="name=value", help="a run for each; '' as it is")
+    parser.add_argument(
+        "--variants", nargs="+", default=[""], metavar="'name=value ...'", help="a run for each; '' as it is"
+    )
     parser.add_argument("--set", nargs="*", default=[], metavar="name=value", help="overrides of every run")
     parser.add_argument("--runs", type=Path, default=Path("runs/study"))
     parser.add_argument("--jobs", type=int, default=2)
@@ -37,10 +39,12 @@ def main() -> None:
         seed, gap, method, variant = job
         checkpoint = args.checkpoints[seed % len(args.checkpoints)]
         label = "-".join(
-            str(x).translate(str.maketrans("/=", "__")) for x in (args.csv.stem, gap, method, variant, seed) if x != ""
+            str(x).translate(str.maketrans("/= ", "__+"))
+            for x in (args.csv.stem, gap, method, variant, seed)
+            if x != ""
         )
         words = [f"gap={gap}", f"method={method}", f"seed={seed}", "log.rerun=false"]
-        words += [variant] if variant else []
+        words += variant.split()
         words += [f"checkpoint={checkpoint}"] if checkpoint else []
         result = finished("deploy", args.runs / label, [*words, *args.set])
         curve = ", ".join(f"{k}: {v:.0%}" for k, v in result["curve"].items())
