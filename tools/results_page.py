@@ -149,6 +149,13 @@ def collect() -> str:
     return pick(read("scale/time_collect.csv"), {**head, "bytes a transition": "bytes_per_step"})
 
 
+def quality() -> str:
+    rows = [{**r, "variant": r["variant"] or "as configured"} for r in read("plan_quality/plan_quality.csv")]
+    head: dict[str, str | tuple[str, Callable[[str], str]]] = {"gap": "gap", "search": "variant"}
+    head |= {"success": ("success", tenth), "low": ("success_low", tenth), "high": ("success_high", tenth)}
+    return pick(rows, {**head, "regret": "regret", "spread": "spread", "ms": "plan_ms"})
+
+
 def updates_per_s() -> float:
     """Updates of the small model on one thread, of as many slices as time_planner takes."""
     wanted = {"what": "update", "size": "small", "horizon": "3", "precision": "float32", "threads": "1"}
@@ -205,6 +212,7 @@ STUDIES: dict[str, Callable[[], str]] = {
     "franka_sim": lambda: records("franka_sim/franka_sim.json"),
     "stability": lambda: records("stability/stability.json"),
     "timing": timing,
+    "plan_quality": quality,
     "scale": collect,
 }
 
