@@ -129,7 +129,10 @@ def timing() -> str:
     diagnose = {"what": "what", "s of data": "seconds_of_data", "names": "names", "wall s": "wall_s", "per unit": "per"}
     env = {"what": "what", "physics steps / s": "physics_steps_per_s", "ControlEnv / this": "control_env_over_this"}
     pairs = (("time_planner", plan), ("time_diagnose", diagnose), ("benchmark_env", env))
-    return "\n\n".join(pick(read(f"timing/{file}.csv"), columns) for file, columns in pairs)
+    parts = [pick(read(f"timing/{file}.csv"), columns) for file, columns in pairs]
+    profile = {name: name for name in ("size", "precision", "operation", "ms", "calls")}
+    large = [row for row in read("timing/profile_update.csv") if float(row["share"]) >= 0.03]
+    return "\n\n".join([*parts, "Where an update's time goes:", pick(large, {**profile, "share": ("share", percent)})])
 
 
 def records(*paths: str) -> str:

@@ -1,7 +1,7 @@
 """Who collects the rounds of pretraining: this process, or others while this one learns.
 
-A round is asked for before its predecessor is learned from, so that there is time to collect it meanwhile; its policy is
-therefore one round old. With as many workers, all give the same numbers.
+A round is asked for before its predecessor is learned from, so that there is time to collect it meanwhile; its policy
+is therefore one round old. With as many workers, all give the same numbers.
 """
 
 import multiprocessing
