@@ -302,3 +302,26 @@ def test_wrong_values_found_while_building_are_the_users() -> None:
     with pytest.raises(ZeroDivisionError), from_config("planner"):
         raise ZeroDivisionError
     assert issubclass(Stopped, KeyboardInterrupt)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda cfg: cfg.pop("collector"), "it had no collector"),
+        (
+            lambda cfg: cfg.collector.update({"_target_": "mpc_sgft.gone.Process"}),
+            "gone.Process has moved since",
+        ),
+        (lambda cfg: None, None),
+    ],
+)
+def test_a_run_of_an_earlier_version_is_refused_by_name(tmp_path, change, says):
+    cfg = compose.compose("pretrain", ["task=push"], [])
+    OmegaConf.set_struct(cfg, False)
+    change(cfg)
+    (tmp_path / "config.yaml").write_text(OmegaConf.to_yaml(cfg, resolve=True))
+    if says is None:
+        assert compose.resume("pretrain", str(tmp_path), [], []).resume == str(tmp_path)
+        return
+    with pytest.raises(UserError, match=f"an earlier version wrote it .*{says}.*versions.json"):
+        compose.resume("pretrain", str(tmp_path), [], [])

@@ -200,10 +200,11 @@ def resume(name: str, folder: str, overrides: Sequence[str], given: Sequence[str
     if not isinstance(cfg, DictConfig) or cfg.get("command") != name:
         wrote = cfg.get("command") if isinstance(cfg, DictConfig) else None
         raise UserError(f"cannot resume {folder} with {name}: {wrote or 'another program'} wrote it.")
-    moved = [target for target in _targets(cfg) if find_spec(target.rpartition(".")[0]) is None]
-    if moved:
+    differs = [f"{t} has moved since" for t in _targets(cfg) if find_spec(t.rpartition(".")[0]) is None]
+    differs += [f"it had no {group}" for group in choices.groups_of(name) if group not in ("experiment", *cfg)]
+    if differs:
         raise UserError(
-            f"cannot resume {folder}: an earlier version wrote it ({moved[0]} has moved since). "
+            f"cannot resume {folder}: an earlier version wrote it ({differs[0]}). "
             "Go on with that version; versions.json there names its commit."
         )
     for override in parse(overrides):

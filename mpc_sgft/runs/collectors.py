@@ -65,8 +65,7 @@ class Process(AbstractCollector):
     """
 
     def __init__(self, cfg: DictConfig, sizes: dict, workers: int = 1) -> None:
-        if not 1 <= workers <= cfg.num_envs:
-            raise UserError(f"collector.workers={workers}: between 1 and num_envs={cfg.num_envs}.")
+        check_workers(workers, cfg.num_envs)
         context = multiprocessing.get_context("spawn")
         self._pools = [
             ProcessPoolExecutor(1, context, initializer=_begin, initargs=(pickle.dumps((cfg, sizes, part, workers)),))
@@ -89,6 +88,12 @@ class Process(AbstractCollector):
     def close(self) -> None:
         for pool in self._pools:
             pool.shutdown(wait=False, cancel_futures=True)
+
+
+def check_workers(workers: int, num_envs: int) -> None:
+    """Raise UserError unless each of the workers has an environment."""
+    if not 1 <= workers <= num_envs:
+        raise UserError(f"collector.workers={workers}: between 1 and num_envs={num_envs}.")
 
 
 @contextmanager

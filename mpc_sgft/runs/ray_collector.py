@@ -15,7 +15,7 @@ import torch
 from omegaconf import DictConfig
 
 from mpc_sgft.command.errors import UserError
-from mpc_sgft.runs.collectors import AbstractCollector
+from mpc_sgft.runs.collectors import AbstractCollector, check_workers
 from mpc_sgft.runs.explore import Collected, Explorer, Round, joined
 
 ANSWER = 10.0  # [s] within which a cluster must accept a connection
@@ -40,8 +40,7 @@ class Ray(AbstractCollector):
             import ray
         except ModuleNotFoundError as error:
             raise UserError("collector=ray needs Ray: pip install 'mpc_sgft[ray]'") from error
-        if not 1 <= workers <= cfg.num_envs:
-            raise UserError(f"collector.workers={workers}: between 1 and num_envs={cfg.num_envs}.")
+        check_workers(workers, cfg.num_envs)
         if address is not None and address != "auto":
             _check_answers(address)
         here = {"num_cpus": workers, "include_dashboard": False, "object_store_memory": STORE}
