@@ -19,6 +19,7 @@ NEEDS = {  # what a test may need, and what brings it
     "the camera's packages": "make system setup",
     "wandb": "make setup",
     "Ray": "make setup",
+    "MuJoCo Warp": "make setup",
     "Linux": "a Linux machine",
     "measured data": "MPC_SGFT_DATA=FOLDER",
     "lerobot's environment": "python -m tools.export_lerobot",

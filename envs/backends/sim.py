@@ -3,6 +3,7 @@
 import logging
 import os
 from collections import Counter
+from importlib.util import find_spec
 
 import mujoco
 import numpy as np
@@ -40,9 +41,10 @@ class SimBackend:
         noise_sd: Standard deviation of the observation noise [m or rad] of noisy episodes.
         noise_probability: Share of episodes that are noisy.
         threads: Simulation threads; 0 takes all cores that this process may use. They do not change the results.
+        physics: `mujoco` on threads, or `warp`: MuJoCo Warp, on a GPU where there is one.
 
     Raises:
-        ValueError: For an effect or a draw that does not fit the task.
+        ValueError: For an effect or a draw that does not fit the task, or physics that is not installed.
     """
 
     def __init__(
@@ -55,6 +57,7 @@ class SimBackend:
         noise_sd: float = 0.0,
         noise_probability: float = 0.0,
         threads: int = 0,
+        physics: str = "mujoco",
     ):
         self.task, self.num_envs, self.effects = task, num_envs, effects or []
         spec = task.spec()
@@ -62,7 +65,7 @@ class SimBackend:
         for effect in self.effects:
             effect.edit_spec(spec)
         self.model = spec.compile()
-        self.batch = Batch(self.model, num_envs, min(threads or _cores(), num_envs))
+        self.batch = _batch(self.model, num_envs, min(threads or _cores(), num_envs), physics)
         self.state = self.batch.bind("qpos"), self.batch.bind("qvel")
         self.qpos, self.qvel = self.state[0][:, : nominal.nq], self.state[1][:, : nominal.nv]
         self.signal, self.act = self.batch.bind("ctrl"), self.batch.bind("act")
@@ -241,6 +244,18 @@ class SimBackend:
         self.unstable = unstable
         self.note = "physics unstable" if unstable[0] else ""
         return unstable.copy()
+
+
+def _batch(model: mujoco.MjModel, num_envs: int, threads: int, physics: str) -> Batch:
+    if physics == "mujoco":
+        return Batch(model, num_envs, threads)
+    if physics != "warp":
+        raise ValueError(f"physics={physics!r}; allowed: mujoco, warp")
+    if find_spec("mujoco_warp") is None:
+        raise ValueError("physics=warp needs MuJoCo Warp: pip install 'mpc_sgft[warp]', or leave physics out.")
+    from envs.backends.warp_batch import WarpBatch  # Warp takes seconds to import
+
+    return WarpBatch(model, num_envs)
 
 
 def _cores() -> int:

@@ -50,7 +50,7 @@ def make_env(
         threads: Of the physics; 0 takes all cores.
 
     Raises:
-        UserError: For an unknown effect, a parameter out of bounds, or a draw that names nothing.
+        UserError: For an unknown effect, a parameter out of bounds, a draw that names nothing, or missing physics.
     """
     with from_config("task"):
         differs = cfg.task.get("in_training") or {} if learning else {}
@@ -64,7 +64,8 @@ def make_env(
             draws = randomize.load(OmegaConf.to_container(cfg.randomize.draws, resolve=True))  # type: ignore[arg-type]
             noise = {"noise_sd": cfg.randomize.noise_sd, "noise_probability": cfg.randomize.noise_probability}
     with from_config("gap"):
-        backend = SimBackend(task, num_envs, effects=present, draws=draws, threads=threads, **noise)
+        physics = cfg.get("physics", "mujoco")
+        backend = SimBackend(task, num_envs, effects=present, draws=draws, threads=threads, physics=physics, **noise)
     return ControlEnv(backend, history=cfg.task.history)
 
 
