@@ -9,12 +9,12 @@ from typing import Any, Concatenate, ParamSpec, TypeVar, cast
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
+from torch.optim.swa_utils import AveragedModel
 
 from mpc_sgft.learning import losses
 from mpc_sgft.learning.layers import products_in
 from mpc_sgft.learning.precision import dtype_of_products
-from mpc_sgft.learning.slices import Slices, check_finite, to_slices
+from mpc_sgft.learning.slices import FiniteWatch, Slices, arranged, check_finite, to_slices
 from mpc_sgft.learning.world_model import WorldModel
 
 PRETRAINED = ("encoder", "dynamics", "reward_head", "q_ensemble", "value_head", "policy_head", "decoder")
@@ -73,6 +73,7 @@ class Agent:
         scale_rate: float,
         entropy_coef: float,
         entropy_lr: float,
+        policy_delay: int = 1,
         precision: str = "float32",
     ) -> None:
         if not 0 <= discount <= 1 or not 0 < rho <= 1:
@@ -80,7 +81,11 @@ class Agent:
         self.device = torch.device(device)
         self.model = model.to(self.device).train()
         self.discount, self.rho, self.grad_clip, self.target_rate = discount, rho, grad_clip, target_rate
+        if policy_delay < 1:
+            raise ValueError(f"policy_delay must be 1 or more updates, got {policy_delay}.")
         self.lr, self.encoder_lr_share, self.entropy_lr = lr, encoder_lr_share, entropy_lr
+        self.policy_delay, self.updates = policy_delay, 0
+        self._watch = FiniteWatch()
         self.weights = {
             "consistency_loss": consistency_weight,
             "reward_loss": reward_weight,
@@ -90,9 +95,11 @@ class Agent:
         }
         self.products = dtype_of_products(precision, int(model.sizes["mlp_dim"]), self.device)
         self.generator = torch.Generator(self.device).manual_seed(seed)
+        on_host = self.device.type == "cpu"
+        self._host_generator = self.generator if on_host else torch.Generator().manual_seed(seed)
         self.scale = losses.RunningScale(scale_rate, self.device)
         self.log_entropy_coef = torch.tensor(entropy_coef, device=self.device).log().requires_grad_()
-        self._averaged = AveragedModel(self.model, multi_avg_fn=get_ema_multi_avg_fn(average_decay))
+        self._averaged, self.average_decay = AveragedModel(self.model), average_decay
         self.pretraining, self.imagined_steps = True, 0
         self.trainable: tuple[str, ...] = (*PRETRAINED, *FOLLOWING)
         self._make_optimizers(lr, lr, lr)
@@ -116,13 +123,20 @@ class Agent:
     # -- learning in simulation ----------------------------------------------------------------------------------------
 
     @_in_own_precision
-    def update(self, batch: TensorDictBase) -> dict[str, float]:
+    def update(self, batch: TensorDictBase, *, read: bool = True) -> dict[str, float]:
         """One step of the TD-MPC2 objective with a value head, on slices [B, T]; returns metrics.
 
+        Args:
+            batch: As from the buffer.
+            read: False: the host does not wait for the device. There are no metrics then, and what is not finite shows
+                in the next update that is read.
+
         Raises:
-            FloatingPointError: If an entry of the batch or a loss is not finite; no parameter has been changed then.
+            FloatingPointError: If an entry of the batch or a loss is not finite; this update has changed no parameter.
         """
-        model, data = self.model, to_slices(batch, self.device)
+        model, data = self.model, arranged(batch, self.device)
+        policy_too = self.updates % self.policy_delay == 0
+        self._note(data.numbers(), read)
         if self.pretraining:
             model.normalizer.update(data.observation[0])
         first_z = model.encode(data.observation[0])  # [B, D], trains the encoder
@@ -148,51 +162,73 @@ class Agent:
             "reward_loss": losses.two_hot_loss(model.reward_logits(zs[:-1], data.action, zs[1:]), r_target),
             "q_loss": losses.two_hot_loss(q_logits, q_target.expand_as(q_logits)).mean(0),
             "value_loss": losses.two_hot_loss(model.value_head(zs.detach()), v_target),
-            "decoder_loss": self._decoder_loss(encoded, data.observation),
         }
+        if policy_too:
+            per_step["decoder_loss"] = self._decoder_loss(encoded, data.observation)
         metrics = {name: losses.over_time(loss, self.rho) for name, loss in per_step.items()}
         total = torch.stack([self.weights[name] * loss for name, loss in metrics.items()]).sum()
-        check_finite(metrics)
+        self._note(metrics, read)
         metrics["loss"] = total
         self.model_optimizer.zero_grad()
         total.backward()
         metrics["grad_norm"] = torch.nn.utils.clip_grad_norm_(self._model_parameters, self.grad_clip, foreach=True)
         self.model_optimizer.step()
 
-        imagine = self.pretraining and self.imagined_steps > 0
-        metrics |= self._update_policy_imagined(encoded[0]) if imagine else self._update_policy(zs.detach())
+        if policy_too:
+            imagine = self.pretraining and self.imagined_steps > 0
+            metrics |= (
+                self._update_policy_imagined(encoded[0], read) if imagine else self._update_policy(zs.detach(), read)
+            )
         model.update_targets(self.target_rate)
         if self.pretraining:
-            self._averaged.update_parameters(model)
+            self._average()
+        self.updates += 1
         metrics["target_value"] = target_q.mean()
-        return floats(metrics)
+        return floats(metrics) if read else {}
 
-    def _update_policy(self, zs: Tensor) -> dict[str, Tensor]:
+    @torch.no_grad()
+    def _average(self) -> None:
+        """The averaged weights follow; `AveragedModel.update_parameters` would wait for the device."""
+        kept, model = self._averaged, self.model
+        share = 1 - self.average_decay if self.updates else 1.0
+        torch._foreach_lerp_([*kept.module.parameters()], [*model.parameters()], share)  # type: ignore
+        for there, here in zip(kept.module.buffers(), model.buffers(), strict=True):
+            there.copy_(here)
+        kept.n_averaged += 1
+
+    def _note(self, values: Mapping[str, Tensor], check: bool) -> None:
+        self._watch.note(values)
+        if check:
+            self._watch.check()
+
+    def _update_policy(self, zs: Tensor, read: bool) -> dict[str, Tensor]:
         action, log_prob = self.model.policy(zs, self._noise(*zs.shape[:-1]))
         heads = None if self.model.num_q == 2 else self._two_heads()
         q = self.model.q(zs, action, heads=heads)  # [2, T + 1, B]
         scale = self.scale.update(q.detach()[:, 0])
         coef = self.log_entropy_coef.detach().exp()
         loss = losses.over_time(losses.policy_loss(q, log_prob, coef, scale), self.rho)
-        metrics = self._step_policy(loss, log_prob) | {"entropy_coef": coef, "scale": scale}
+        metrics = self._step_policy(loss, log_prob, read) | {"entropy_coef": coef, "scale": scale}
         self._tune_entropy(log_prob)
         return metrics
 
-    def _update_policy_imagined(self, starts: Tensor) -> dict[str, Tensor]:
+    def _update_policy_imagined(self, starts: Tensor, read: bool) -> dict[str, Tensor]:
         coef = self.log_entropy_coef.detach().exp()
-        metrics, log_prob = self._climb(starts, self.imagined_steps, coef)
+        metrics, log_prob = self._climb(starts, self.imagined_steps, coef, read)
         self._tune_entropy(log_prob)
         return metrics | {"entropy_coef": coef}
 
-    def _climb(self, starts: Tensor, horizon: int, coef: Tensor | float) -> tuple[dict[str, Tensor], Tensor]:
+    def _climb(
+        self, starts: Tensor, horizon: int, coef: Tensor | float, read: bool
+    ) -> tuple[dict[str, Tensor], Tensor]:
         noise = self._noise(horizon, len(starts))
         objective, log_prob = losses.imagined_objective(self.model, starts, noise, self.discount)
         scale = self.scale.update(objective.detach())
-        metrics = self._step_policy(coef * log_prob.mean() - objective.mean() / scale, log_prob)
+        metrics = self._step_policy(coef * log_prob.mean() - objective.mean() / scale, log_prob, read)
         return metrics | {"objective": objective.mean(), "scale": scale}, log_prob
 
-    def _step_policy(self, loss: Tensor, log_prob: Tensor) -> dict[str, Tensor]:
-        check_finite({"policy_loss": loss})
+    def _step_policy(self, loss: Tensor, log_prob: Tensor, read: bool) -> dict[str, Tensor]:
+        self._note({"policy_loss": loss}, read)
         parameters = list(self.model.policy_head.parameters())
         self.policy_optimizer.zero_grad()
         loss.backward(inputs=parameters)  # the critics and the dynamics collect no gradient here
@@ -281,7 +317,7 @@ class Agent:
     @_in_own_precision
     def climb(self, starts: Tensor, *, horizon: int, entropy_coef: float) -> dict[str, Tensor]:
         """A step of the policy prior up the SGFT objective of `horizon` imagined steps from latents [B, D]."""
-        return self._climb(starts, horizon, entropy_coef)[0]
+        return self._climb(starts, horizon, entropy_coef, read=True)[0]
 
     @torch.no_grad()
     def model_error(self, batch: TensorDictBase) -> Tensor:
@@ -325,8 +361,11 @@ class Agent:
             "model": {name: x.detach().clone() for name, x in self.model.state_dict().items()},
             "averaged": self._averaged.state_dict() if self.pretraining else None,
             "snapshot": self.snapshot(),
+            "updates": self.updates,
             "generator": self.generator.get_state(),
+            "host_generator": self._host_generator.get_state(),
             "torch_rng": torch.get_rng_state(),
+            "cuda_rng": torch.cuda.get_rng_state(self.device) if self.device.type == "cuda" else None,
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -341,8 +380,12 @@ class Agent:
         if state["averaged"] is not None:
             self._averaged.load_state_dict(state["averaged"])
         self.restore(state["snapshot"])
+        self.updates = state["updates"]
         self.generator.set_state(state["generator"].cpu())
+        self._host_generator.set_state(state["host_generator"].cpu())
         torch.set_rng_state(state["torch_rng"].cpu())
+        if state["cuda_rng"] is not None and self.device.type == "cuda":
+            torch.cuda.set_rng_state(state["cuda_rng"].cpu(), self.device)
 
     # -- helpers -------------------------------------------------------------------------------------------------------
 
@@ -359,7 +402,7 @@ class Agent:
         self._model_parameters = [p for group in groups for p in group["params"]]
         self.model_optimizer = torch.optim.Adam(groups, fused=True)
         self.policy_optimizer = torch.optim.Adam(model.policy_head.parameters(), lr=policy_lr, eps=1e-5, fused=True)
-        self.entropy_optimizer = torch.optim.Adam([self.log_entropy_coef], lr=self.entropy_lr)
+        self.entropy_optimizer = torch.optim.Adam([self.log_entropy_coef], lr=self.entropy_lr, fused=True)
 
     def _optimizers(self) -> dict[str, torch.optim.Adam]:
         return {"model": self.model_optimizer, "policy": self.policy_optimizer, "entropy": self.entropy_optimizer}
@@ -381,7 +424,7 @@ class Agent:
         return torch.randn(*shape, self.model.action_dim, generator=self.generator, device=self.device)
 
     def _two_heads(self) -> list[int]:
-        return torch.randperm(self.model.num_q, generator=self.generator, device=self.device)[:2].tolist()
+        return torch.randperm(self.model.num_q, generator=self._host_generator)[:2].tolist()
 
 
 def floats(metrics: Mapping[str, Tensor]) -> dict[str, float]:

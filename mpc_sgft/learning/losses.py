@@ -103,11 +103,12 @@ class RunningScale:
 
     def __init__(self, rate: float, device: torch.device | str = "cpu") -> None:
         self.rate = rate
+        self.ends = torch.tensor([0.05, 0.95], device=device)
         self.value = torch.ones((), device=device)
 
     @torch.no_grad()
     def update(self, x: Tensor) -> Tensor:
         """Take in a batch of any shape; returns the range, a scalar tensor."""
-        low, high = torch.quantile(x.flatten(), torch.tensor([0.05, 0.95], device=x.device))
+        low, high = torch.quantile(x.flatten(), self.ends)
         self.value = torch.lerp(self.value, (high - low).clamp_min(1.0), self.rate)
         return self.value

@@ -16,24 +16,53 @@ class Slices(NamedTuple):
     reward: Tensor  # [T, B]
     terminated: Tensor  # [T, B] bool
 
+    def numbers(self) -> dict[str, Tensor]:
+        """What must be finite."""
+        return {"observation": self.observation, "action": self.action, "reward": self.reward}
+
 
 def to_slices(batch: TensorDictBase, device: torch.device) -> Slices:
-    """Rearrange a batch [B, T] of the buffer.
+    """A batch [B, T] of the buffer as `arranged`.
 
     Raises:
         FloatingPointError: If an entry is not finite.
     """
+    data = arranged(batch, device)
+    check_finite(data.numbers())
+    return data
+
+
+def arranged(batch: TensorDictBase, device: torch.device) -> Slices:
+    """Rearrange a batch [B, T] of the buffer; nothing is asked of the device."""
     first = batch.get("observation")[:, :1]
     observation = torch.cat([first, batch.get(("next", "observation"))], 1).transpose(0, 1)
     reward, terminated = (batch.get(("next", key)).squeeze(-1).t() for key in ("reward", "terminated"))
-    data = Slices(*(x.to(device) for x in (observation, batch.get("action").transpose(0, 1), reward, terminated)))
-    check_finite({"observation": data.observation, "action": data.action, "reward": data.reward})
-    return data
+    return Slices(*(x.to(device) for x in (observation, batch.get("action").transpose(0, 1), reward, terminated)))
 
 
 def check_finite(values: Mapping[str, Tensor]) -> None:
     """Raise FloatingPointError that names every tensor with an entry that is not finite."""
-    finite = torch.stack([v.detach().isfinite().all() for v in values.values()]).tolist()
-    if not all(finite):
-        bad = [name for name, ok in zip(values, finite, strict=True) if not ok]
-        raise FloatingPointError(f"{', '.join(bad)} is not finite; this update was not applied.")
+    watch = FiniteWatch()
+    watch.note(values)
+    watch.check()
+
+
+class FiniteWatch:
+    """Notes on the device which values were not finite, so that the host need not wait until it asks."""
+
+    def __init__(self) -> None:
+        self._finite: dict[str, Tensor] = {}
+
+    def note(self, values: Mapping[str, Tensor]) -> None:
+        """Look at values of any shape."""
+        for name, x in values.items():
+            finite = x.detach().isfinite().all()
+            self._finite[name] = finite & self._finite[name] if name in self._finite else finite
+
+    def check(self) -> None:
+        """Raise FloatingPointError that names what was not finite since the last check."""
+        noted, self._finite = self._finite, {}
+        finite = torch.stack([*noted.values()]).tolist() if noted else []
+        bad = [name for name, ok in zip(noted, finite, strict=True) if not ok]
+        if bad:
+            raise FloatingPointError(f"{', '.join(bad)} is not finite in an update.")

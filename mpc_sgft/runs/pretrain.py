@@ -90,8 +90,8 @@ def pretrain(cfg: DictConfig) -> int:
         agent.hold_value(state["transitions"] <= cfg.hold_value)
         owed = int(state["transitions"] * cfg.updates_per_transition) - state["updates"]
         with watch("update"):
-            for _ in range(owed):
-                metrics |= agent.update(buffer.sample())
+            for left in reversed(range(owed)):
+                metrics |= agent.update(buffer.sample(), read=left < cfg.train.agent.policy_delay)
         state["updates"] += owed
         state["round"] += 1
         if state["round"] % cfg.eval_every == 0 or state["transitions"] >= cfg.transitions:

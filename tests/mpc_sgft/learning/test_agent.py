@@ -6,6 +6,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torch.testing import assert_close
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from mpc_sgft.learning.agent import Agent
 from mpc_sgft.learning.world_model import PARTS, WorldModel
@@ -248,7 +249,7 @@ def test_resume_gives_the_same_numbers(method):
 def test_a_policy_update_leaves_no_gradient_in_the_critics():
     agent = make_agent()
     agent.model_optimizer.zero_grad()
-    agent._update_policy(agent.model.encode(torch.randn(2, 5, 6)).detach())
+    agent._update_policy(agent.model.encode(torch.randn(2, 5, 6)).detach(), read=True)
     assert all(p.grad is None for p in agent.model.q_ensemble.parameters())
 
 
@@ -300,6 +301,69 @@ def test_a_loss_that_is_not_finite_is_named_and_changes_nothing():
     with pytest.raises(FloatingPointError, match="^reward_loss is not finite"):
         agent.update(make_batch())
     assert changed(before, parts(agent)) == {"normalizer", "reward_head"}  # nan is never equal to itself
+
+
+class _NoWaiting(TorchDispatchMode):
+    """Refuses what brings a number from the device to the host."""
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        assert func is not torch.ops.aten._local_scalar_dense.default, "the host waits for the device"
+        return func(*args, **(kwargs or {}))
+
+
+@pytest.mark.parametrize("delay", [1, 2])
+def test_the_host_waits_for_no_update_that_is_not_read(monkeypatch, delay):
+    agent = make_agent({"dropout": 0.0}, policy_delay=delay)  # on a CPU dropout counts its entries there
+    agent.update(make_batch())
+
+    def refuse(*_):
+        raise AssertionError("the host waits for the device")
+
+    with monkeypatch.context() as patch, _NoWaiting():
+        for name in ("tolist", "item", "numpy", "cpu", "__bool__", "__float__", "__int__"):
+            patch.setattr(torch.Tensor, name, refuse)
+        assert agent.update(make_batch(1), read=False) == {}
+        with pytest.raises(AssertionError):
+            agent.update(make_batch(2))
+
+
+@pytest.mark.gpu
+def test_the_host_waits_for_no_update_on_a_gpu_either():
+    agent = make_agent(device="cuda")
+    batch = make_batch().to("cuda")
+    agent.update(batch)
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        agent.update(batch, read=False)
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    assert agent.update(batch)["loss"] > 0
+
+
+def test_an_update_that_is_not_read_is_the_same_update_and_what_was_not_finite_shows_in_the_next():
+    read, unread = make_agent(), make_agent()
+    for i in range(4):
+        torch.manual_seed(i)  # of dropout
+        read.update(make_batch(i))
+        torch.manual_seed(i)
+        unread.update(make_batch(i), read=False)
+    assert changed(parts(read), parts(unread)) == set()
+    batch = make_batch()
+    batch["next", "reward"][0, 0] = torch.inf
+    unread.update(batch, read=False)
+    with pytest.raises(FloatingPointError, match="^reward is not finite"):
+        unread.update(make_batch())
+
+
+def test_with_a_delay_the_policy_and_the_decoder_learn_in_every_second_update():
+    agent, moved = make_agent(policy_delay=2), []
+    for i in range(4):
+        before = parts(agent)
+        agent.update(make_batch(i))
+        moved.append(changed(before, parts(agent)) & {"policy_head", "decoder", "value_head"})
+    assert moved == [{"policy_head", "decoder", "value_head"}, {"value_head"}] * 2
+    with pytest.raises(ValueError, match="policy_delay"):
+        make_agent(policy_delay=0)
 
 
 def test_while_the_value_is_held_encoder_and_value_head_stay_and_all_else_learns():
