@@ -28,15 +28,14 @@ class SliceSampler(Sampler):
         capacity: Rows of the storage.
         slice_len: Steps of a slice [T].
         seed: Of the sampler's own generator.
+        device: Where the links between rows live, and where samples are drawn.
     """
 
-    def __init__(self, capacity: int, slice_len: int, seed: int) -> None:
+    def __init__(self, capacity: int, slice_len: int, seed: int, device: torch.device) -> None:
         self.slice_len = slice_len
-        self.generator = torch.Generator().manual_seed(seed)
-        self.previous = torch.full((capacity,), NONE)
-        self.following = torch.full((capacity,), NONE)
-        self.episode = torch.full((capacity,), NONE)
-        self.valid = torch.zeros(capacity, dtype=torch.bool)  # T steps follow, this one included
+        self.generator = torch.Generator(device).manual_seed(seed)
+        self.previous, self.following, self.episode = (torch.full((capacity,), NONE, device=device) for _ in range(3))
+        self.valid = torch.zeros(capacity, dtype=torch.bool, device=device)  # T steps follow, this one included
         self.tails: dict[int, tuple[int, int]] = {}  # episode -> (last row, its step)
         self._starts: Tensor | None = None
 
@@ -49,8 +48,8 @@ class SliceSampler(Sampler):
         self.episode[index] = episode
         self._join(index[:-1][goes_on], index[1:][goes_on])
         cut = (~goes_on).nonzero().flatten()
-        first = torch.cat([torch.zeros(1, dtype=torch.long), cut + 1])  # of each run of consecutive steps
-        last = torch.cat([cut, torch.tensor([len(index) - 1])])
+        first = torch.cat([cut.new_zeros(1), cut + 1])  # of each run of consecutive steps
+        last = torch.cat([cut, cut.new_full((1,), len(index) - 1)])
         runs = torch.stack([episode[first], step[first], index[first], step[last], index[last]], 1).tolist()
         joins = []
         for e, s, row, last_step, last_row in runs:
@@ -59,7 +58,7 @@ class SliceSampler(Sampler):
                 joins.append((tail[0], row))
             self.tails[e] = (last_row, last_step)
         if joins:
-            self._join(*torch.tensor(joins).unbind(1))
+            self._join(*torch.tensor(joins, device=index.device).unbind(1))
         start = index
         for _ in range(self.slice_len - 1):
             start = start[start != NONE]
@@ -94,7 +93,8 @@ class SliceSampler(Sampler):
                 f"The buffer holds {len(storage)} steps but no {self.slice_len} consecutive steps of one episode; "
                 "collect more before sampling."
             )
-        row = self._starts[torch.randint(len(self._starts), (batch_size,), generator=self.generator)]
+        drawn = torch.randint(len(self._starts), (batch_size,), generator=self.generator, device=self.generator.device)
+        row = self._starts[drawn]
         rows = [row]
         for _ in range(self.slice_len - 1):
             rows.append(self.following[rows[-1]])
@@ -113,7 +113,7 @@ class SliceSampler(Sampler):
         self._starts = None
 
     def _empty(self) -> None:
-        self._forget(torch.arange(len(self.valid)))
+        self._forget(torch.arange(len(self.valid), device=self.valid.device))
         self._starts = None
 
     def dumps(self, path: Any) -> None:
@@ -126,11 +126,12 @@ class SliceSampler(Sampler):
 class SliceBuffer:
     """Ring buffer of transitions that returns slices [B, T]; build it with `make_buffer`."""
 
-    def __init__(self, capacity: int, slice_len: int, batch_size: int, seed: int) -> None:
-        self.capacity = capacity
-        self.sampler = SliceSampler(capacity, slice_len, seed)
+    def __init__(self, capacity: int, slice_len: int, batch_size: int, seed: int, device: torch.device) -> None:
+        self.capacity, self.device = capacity, device
+        self.sampler = SliceSampler(capacity, slice_len, seed, device)
+        storage = LazyTensorStorage(capacity, device=device)
         self._replay = TensorDictReplayBuffer(
-            storage=LazyTensorStorage(capacity), sampler=self.sampler, batch_size=batch_size, priority_key="none"
+            storage=storage, sampler=self.sampler, batch_size=batch_size, priority_key="none"
         )
 
     def extend(self, steps: TensorDictBase) -> int:
@@ -150,8 +151,8 @@ class SliceBuffer:
                 f"{len(flat)} transitions do not fit a buffer of {self.capacity}; extend in smaller pieces."
             )
         if len(flat):
-            index = self._replay.extend(flat, update_priority=False)
-            self.sampler.link(index, flat["episode"].cpu(), flat["step"].cpu())
+            index = torch.as_tensor(self._replay.extend(flat, update_priority=False))
+            self.sampler.link(*(x.to(self.device) for x in (index, flat["episode"], flat["step"])))
         return len(flat)
 
     def sample(self) -> TensorDictBase:
@@ -182,12 +183,14 @@ class SliceBuffer:
         if state["data"]:
             n = len(next(iter(state["data"].values())))
             data = TensorDict(state["data"], batch_size=[n]).unflatten_keys("/")
-            self._replay.storage.set(torch.arange(n), data)  # type: ignore[arg-type]
+            self._replay.storage.set(torch.arange(n), data.to(self.device))  # type: ignore[arg-type]
         self._replay.writer.load_state_dict(state["writer"])
         self.sampler.load_state_dict(state["sampler"])
 
 
-def make_buffer(capacity: int, slice_len: int, batch_size: int, seed: int) -> SliceBuffer:
+def make_buffer(
+    capacity: int, slice_len: int, batch_size: int, seed: int, device: torch.device | str = "cpu"
+) -> SliceBuffer:
     """Replay of at most `capacity` transitions [B, T] = [batch_size, slice_len].
 
     Args:
@@ -195,6 +198,7 @@ def make_buffer(capacity: int, slice_len: int, batch_size: int, seed: int) -> Sl
         slice_len: Consecutive steps of a slice [T]; shorter episodes contribute nothing.
         batch_size: Slices of a batch [B].
         seed: Of the sampling.
+        device: Where the transitions are kept: on that of the learner a batch need not travel.
 
     Raises:
         ValueError: If capacity < slice_len or a number is not positive.
@@ -204,4 +208,4 @@ def make_buffer(capacity: int, slice_len: int, batch_size: int, seed: int) -> Sl
             "make_buffer wants 1 <= slice_len <= capacity and batch_size >= 1, "
             f"got slice_len={slice_len}, capacity={capacity}, batch_size={batch_size}."
         )
-    return SliceBuffer(capacity, slice_len, batch_size, seed)
+    return SliceBuffer(capacity, slice_len, batch_size, seed, torch.device(device))

@@ -43,9 +43,8 @@ class Transfer:
     def __init__(self, agent: Agent, method: AbstractMethod, *, capacity: int, batch_size: int, seed: int):
         self.agent, self.method, self.slice_len = agent, method, method.slice_len
         method.take_over(agent)
-        self._new_buffer = partial(
-            make_buffer, capacity=capacity, slice_len=method.slice_len, batch_size=batch_size, seed=seed
-        )
+        sizes = {"capacity": capacity, "slice_len": method.slice_len, "batch_size": batch_size}
+        self._new_buffer = partial(make_buffer, **sizes, seed=seed, device=agent.device)
         self.buffer = self._new_buffer()
         self.pretrained = copy.deepcopy(agent.model)
         self.acting: WorldModel = copy.deepcopy(agent.model)

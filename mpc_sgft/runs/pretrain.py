@@ -31,7 +31,7 @@ def pretrain(cfg: DictConfig) -> int:
     agent = start_agent(cfg, judge)
     round_size = cfg.num_envs * judge.task.episode_steps
     agent.imagined_steps = cfg.imagined_steps
-    buffer = instantiate(cfg.train.replay, seed=cfg.seed)
+    buffer = instantiate(cfg.train.replay, seed=cfg.seed, device=agent.device)
     state = {"round": 0, "updates": 0, "transitions": 0, "episodes": 0, "seconds": 0.0, "streak": 0, "unstable": 0}
     watch = Stopwatch("wait", "update", "evaluate", "save")
     saved = folder / "checkpoint" / "state.pt"

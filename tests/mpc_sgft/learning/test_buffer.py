@@ -49,12 +49,13 @@ def assert_slices_are_exactly_the_possible_ones(buffer, slice_len, batches=60):
     assert seen == possible_starts(buffer, slice_len)
 
 
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
 @pytest.mark.parametrize("slice_len", [1, 2, 3, 5])
 @pytest.mark.parametrize("capacity", [23, 64, 1000])
-def test_slices_of_episodes_in_pieces_interleaved_and_wrapped(slice_len, capacity):
+def test_slices_of_episodes_in_pieces_interleaved_and_wrapped(slice_len, capacity, device):
     """Four environments with episodes of all lengths arrive in chunks of all lengths; the ring wraps many times."""
     generator = torch.Generator().manual_seed(capacity + slice_len)
-    buffer = make_buffer(capacity, slice_len, 512, seed=0)
+    buffer = make_buffer(capacity, slice_len, 512, seed=0, device=device)
     episodes, position, new = [0, 1, 2, 3], [0, 0, 0, 0], 4
     for _ in range(60):
         count = int(torch.randint(1, 5, (), generator=generator))

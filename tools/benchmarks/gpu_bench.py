@@ -1,0 +1,124 @@
+"""What a GPU brings: plans, updates, environment steps, and pretraining push end to end.
+
+    python -m tools.benchmarks.gpu_bench [--sizes 1M 5M 48M] [--envs 4096] [--pretrain] [--out CSV]
+
+Each row is measured after a call that is not counted, with the device waited for before the clock is read. An update
+is one of twenty of which the last is read, as in pretraining. `--device cpu` runs the same on the processor: to see
+that it works, or to compare.
+"""
+
+import argparse
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from statistics import median
+
+import torch
+from hydra.utils import instantiate
+from omegaconf import OmegaConf
+
+from mpc_sgft.command import compose
+from mpc_sgft.learning.agent import Agent
+from mpc_sgft.learning.world_model import WorldModel
+from mpc_sgft.runs import build
+from mpc_sgft.runs.collect import collect, planner_policy, random_policy
+from planners.mppi import MPPI
+from tools.benchmarks.time_planner import ROOT, SEARCH, UPSTREAM, cpu_name, random_batch
+from tools.studies.runner import write
+
+COLUMNS = ["what", "size", "precision", "count", "median_ms", "per_second", "success", "device", "torch"]
+UPDATES = 20  # of which the last is read
+
+
+def seconds(call: Callable[[], object], repeats: int, device: torch.device) -> float:
+    """Median time [s] of a call that the device has finished, after one that is not counted."""
+    found = []
+    for _ in range(repeats + 1):
+        start = time.perf_counter()
+        call()
+        if device.type == "cuda":
+            torch.cuda.synchronize(device)
+        found.append(time.perf_counter() - start)
+    return median(found[1:])
+
+
+def networks(size: str, precision: str, device: torch.device, repeats: int) -> list[dict[str, object]]:
+    """One plan (H = 4, upstream's search) and one update (256 slices of 3 steps)."""
+    obs_dim, action_dim = UPSTREAM
+    sizes = {"obs_dim": obs_dim, "action_dim": action_dim, "decode_dim": obs_dim}
+    model: WorldModel = instantiate(OmegaConf.load(ROOT / f"configs/model/{size}.yaml"), **sizes)
+    numbers = OmegaConf.load(ROOT / "configs/train/default.yaml").agent
+    agent: Agent = instantiate(numbers, model=model, discount=0.99, precision=precision, device=device)
+    planner = MPPI(action_dim=action_dim, horizon=4, precision=precision, **SEARCH)
+    act, batch = planner_policy(agent.model, planner, seed=0), random_batch(obs_dim, action_dim, 3).to(device)
+    observation, fresh = torch.randn(1, obs_dim), torch.zeros(1, dtype=torch.bool)
+
+    def updates() -> None:
+        for left in reversed(range(UPDATES)):
+            agent.update(batch, read=left == 0)
+
+    plan = seconds(lambda: act(observation, fresh), repeats, device)
+    update = seconds(updates, max(1, repeats // 5), device) / UPDATES
+    return [
+        {"what": what, "size": size, "precision": precision, "count": 1, "median_ms": round(1e3 * found, 2)}
+        for what, found in (("plan", plan), ("update", update))
+    ]
+
+
+def environments(count: int, physics: str, repeats: int, device: torch.device) -> dict[str, object]:
+    """Control steps a second of push, randomised, under random actions; resets are counted in."""
+    cfg = compose.compose("pretrain", ["task=push", f"physics={physics}"], [])
+    env = build.make_env(cfg, count, randomised=True, learning=True)
+    act, steps = random_policy(env, 0), env.task.episode_steps * count
+    found = seconds(lambda: collect(env, act, seed=0), repeats, device)
+    row = {"what": "environment steps", "size": physics, "precision": "float32" if physics == "warp" else "float64"}
+    return row | {"count": count, "median_ms": round(1e3 * found, 1), "per_second": round(steps / found)}
+
+
+def pretraining(device: torch.device, folder: Path) -> dict[str, object]:
+    """Push from scratch with the default settings on the device."""
+    words = ["task=push", f"device={device.type}", f"run_dir={folder}", "quiet=true"]
+    subprocess.run([sys.executable, "-m", "mpc_sgft.pretrain", *words], check=True)
+    done = json.loads((folder / "summary.json").read_text())
+    row = {"what": "pretrain push", "size": "small", "precision": "auto", "count": done["transitions"]}
+    return row | {"median_ms": round(1e3 * done["wall_seconds"]), "success": done["success"]}
+
+
+def main(arguments: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--device", default="cuda", choices=["cuda", "cpu"])
+    parser.add_argument("--sizes", nargs="*", default=["1M", "5M", "48M"])
+    parser.add_argument("--envs", type=int, default=4096, help="environments side by side; 0 leaves them out")
+    parser.add_argument("--physics", nargs="+", default=["warp", "mujoco"], choices=["warp", "mujoco"])
+    parser.add_argument("--repeats", type=int, default=20)
+    parser.add_argument("--pretrain", type=Path, metavar="DIR", help="also pretrain push, into this new folder")
+    parser.add_argument("--out", type=Path, default=ROOT / "results/timing/gpu_bench.csv")
+    args = parser.parse_args(arguments)
+    device = torch.device(args.device)
+    if device.type == "cuda" and not torch.cuda.is_available():
+        parser.exit(2, "error: PyTorch finds no CUDA device here; --device cpu runs the same on the processor.\n")
+    name = torch.cuda.get_device_name(device) if device.type == "cuda" else cpu_name()
+    rows: list[dict[str, object]] = []
+
+    def keep(found: dict[str, object]) -> None:
+        rows.append(found | {"device": name, "torch": torch.__version__})
+        print(found, flush=True)
+        write(args.out, COLUMNS, rows)
+
+    for size in args.sizes:
+        for precision in ("float32", "bfloat16"):
+            for found in networks(size, precision, device, args.repeats):
+                keep(found)
+    for physics in args.physics if args.envs else []:
+        keep(environments(args.envs, physics, max(1, args.repeats // 10), device))
+    if args.pretrain is not None:
+        keep(pretraining(device, args.pretrain))
+    print(f"written to {args.out}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
