@@ -121,8 +121,9 @@ def _sweep(command: Command, overrides: list[str]) -> int:
 
     from mpc_sgft.command import compose
 
+    several = any(override.is_sweep_override() for override in compose.parse(overrides))
     for text in overrides:
-        if text.startswith("run_dir=") and "," not in text and "${" not in text:
+        if several and text.startswith("run_dir=") and "," not in text and "${" not in text:
             raise UserError(
                 f"{text!r} would be shared by all runs of the sweep. Write run_dir='{text[8:]}/${{hydra:job.num}}'."
             )

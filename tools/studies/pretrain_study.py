@@ -24,11 +24,14 @@ def main() -> None:
     parser.add_argument("--set", nargs="*", default=[], metavar="name=value", help="overrides of every run")
     parser.add_argument("--runs", type=Path, default=Path("runs/pretrain"))
     parser.add_argument("--jobs", type=int, default=1, help="runs side by side; more are slower each")
+    parser.add_argument(
+        "--launcher", help="Hydra launcher of the runs, e.g. submitit_slurm; its settings go into --set"
+    )
     args = parser.parse_args()
 
     def work(seed: int) -> dict:
         overrides = [f"task={args.task}", f"seed={seed}", *args.set]
-        result = finished("pretrain", args.runs / f"{args.task}-{seed}", overrides)
+        result = finished("pretrain", args.runs / f"{args.task}-{seed}", overrides, args.launcher)
         low, high = result["success_interval"]
         return result | {"success_low": round(low, 3), "success_high": round(high, 3)}
 

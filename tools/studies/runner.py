@@ -21,8 +21,14 @@ class RunFailed(Exception):
     """A run of a study ended with an error; the message holds the end of what it said."""
 
 
-def finished(command: str, folder: Path, overrides: Sequence[str]) -> dict[str, Any]:
+def finished(command: str, folder: Path, overrides: Sequence[str], launcher: str | None = None) -> dict[str, Any]:
     """The summary of `python -m mpc_sgft.COMMAND` in a run folder: read if it is there, else run or resumed.
+
+    Args:
+        command: Which.
+        folder: The run folder; with a launcher, where the other machines see it too.
+        overrides: Of the run, and of the launcher.
+        launcher: A Hydra launcher that starts the run elsewhere; None: here. What it was cut off is not resumed.
 
     Raises:
         RunFailed: If the command does.
@@ -30,7 +36,14 @@ def finished(command: str, folder: Path, overrides: Sequence[str]) -> dict[str, 
     summary = folder / "summary.json"
     if not summary.exists():
         words = [f"run_dir={folder}", "quiet=true", *overrides]
-        words = ["--resume", str(folder)] if (folder / "config.yaml").exists() else words
+        begun = (folder / "config.yaml").exists()
+        if launcher is not None and begun:
+            raise RunFailed(
+                f"{folder}: begun and not finished. Wait for it, or remove it; without a launcher it goes on."
+            )
+        if launcher is not None:
+            words = ["-m", f"hydra/launcher={launcher}", f"hydra.sweep.dir={folder}.sweep", *words]
+        words = ["--resume", str(folder)] if begun else words
         line = [sys.executable, "-m", f"mpc_sgft.{command}", *words]
         done = subprocess.run(line, capture_output=True, text=True, env=os.environ | {"OMP_NUM_THREADS": "1"})
         if done.returncode:

@@ -4,7 +4,8 @@
     python -m tools.studies.study results/horizon/horizon.csv --gaps sluggish --variants horizon=1 "horizon=2 gamma=0.9"
 
 Each run is `python -m mpc_sgft.deploy` in a process of its own with one thread; its folder is kept under --runs, and a
-run whose summary is there is not repeated. With several --checkpoints, seed s uses number s modulo their count.
+run whose summary is there is not repeated; --launcher starts the runs on other machines. With several --checkpoints,
+seed s uses number s modulo their count.
 """
 
 import argparse
@@ -31,7 +32,10 @@ def main() -> None:
     )
     parser.add_argument("--set", nargs="*", default=[], metavar="name=value", help="overrides of every run")
     parser.add_argument("--runs", type=Path, default=Path("runs/study"))
-    parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--jobs", type=int, default=2, help="runs side by side")
+    parser.add_argument(
+        "--launcher", help="Hydra launcher of the runs, e.g. submitit_slurm; its settings go into --set"
+    )
     args = parser.parse_args()
     jobs = list(itertools.product(args.seeds, args.gaps, args.methods, args.variants))
 
@@ -46,7 +50,7 @@ def main() -> None:
         words = [f"gap={gap}", f"method={method}", f"seed={seed}", "log.rerun=false"]
         words += variant.split()
         words += [f"checkpoint={checkpoint}"] if checkpoint else []
-        result = finished("deploy", args.runs / label, [*words, *args.set])
+        result = finished("deploy", args.runs / label, [*words, *args.set], args.launcher)
         curve = ", ".join(f"{k}: {v:.0%}" for k, v in result["curve"].items())
         print(f"{label}: {curve} ({result['wall_seconds']:.0f} s)", flush=True)
         return result | {"variant": variant}

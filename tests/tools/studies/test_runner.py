@@ -22,6 +22,21 @@ def test_a_run_is_made_once_and_resumed_if_cut_off(tmp_path):
     assert (run / "checkpoint" / "state.pt").stat().st_mtime_ns > stamp
 
 
+def test_a_launcher_starts_a_run_elsewhere(tmp_path):
+    """submitit's own local executor: a process of its own, as on a cluster that runs SLURM."""
+    pytest.importorskip("hydra_plugins.hydra_submitit_launcher", reason="needs submitit")
+    run, launcher = tmp_path / "run", "submitit_local"
+    words = ["policy=scripted", "episodes=2", "hydra.launcher.timeout_min=2"]
+    assert finished("evaluate", run, words, launcher)["success"] == 1.0
+    assert list((tmp_path / "run.sweep" / ".submitit").glob("*/*_log.out"))
+    with pytest.raises(RunFailed, match="error: No checkpoint at /nowhere"):
+        finished("evaluate", tmp_path / "bad", ["checkpoint=/nowhere/at/all", "episodes=2"], launcher)
+    (tmp_path / "begun").mkdir()
+    (tmp_path / "begun" / "config.yaml").touch()
+    with pytest.raises(RunFailed, match="begun and not finished"):
+        finished("evaluate", tmp_path / "begun", words, launcher)
+
+
 def test_a_failure_is_told_and_the_others_go_on(tmp_path, capsys):
     def work(name):
         if name == "bad":
