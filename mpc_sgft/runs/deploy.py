@@ -101,7 +101,9 @@ class Deployment:
         self.verdicts = Verdicts(self, ask=person.asks(cfg))
         self.stop = StopRequest("rollout")
         self.viewer = (
-            DeployViewer(self.folder / "run.rrd", env, resume=cfg.resume is not None) if cfg.log.rerun else None
+            DeployViewer(self.folder / "run.rrd", env, megabytes=cfg.log.get("rerun_mb", 300), resume=bool(cfg.resume))
+            if cfg.log.rerun
+            else None
         )
         self.began = time.monotonic() - self.state["seconds"]
 

@@ -10,7 +10,7 @@
 | `/guided`     | control period  | S samples while a person moves the arm: time, qpos, qvel, force, object [S,3] m   |
 
 Messages are JSON, so Foxglove, `mcap cat` and ten lines of any language can read them. The messages of one step share
-one chunk with a checksum: a step is in the file completely or not at all. Times are seconds since the episode's start.
+one compressed chunk with a checksum: a step is in the file completely or not at all. Times are seconds since the episode's start.
 A number that is not finite is written as null (JSON has no NaN) and read back as nan. Float32 survives the round trip
 exactly. The gap between simulation and reality is what `diagnose` has to find, so metadata that names it is refused.
 """
@@ -28,6 +28,7 @@ from mcap.records import Channel, Footer, Message
 from mcap.stream_reader import CRCValidationError, StreamReader
 from mcap.well_known import MessageEncoding, SchemaEncoding
 from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
+from zstandard import ZstdError
 
 TRANSITION_KEYS = (
     "step",
@@ -105,7 +106,7 @@ class EpisodeWriter:
         self._time = 0  # [ns] since the episode's start
         self._keys: set[str] = set()
         self._file: BinaryIO | None = self.path.open("xb")
-        self._writer = Writer(self._file, compression=CompressionType.NONE)  # damage stays local, checksums find it
+        self._writer = Writer(self._file, compression=CompressionType.ZSTD)  # each step by itself: damage stays local
         try:
             self._writer.start(profile="", library="mpc_sgft")
             self._channels = {topic: self._register(topic) for topic in TOPICS}
@@ -262,7 +263,7 @@ def scan(path: str | Path) -> Scan:
                 closed = isinstance(record, Footer)
         except EndOfFile:
             problem = "it was never closed" if whole == size else "it ends in the middle of a record"
-        except (InvalidMagic, CRCValidationError, McapError) as error:
+        except (InvalidMagic, CRCValidationError, McapError, ZstdError) as error:
             problem = f"it is damaged ({error})"
     if (topics or closed) and not set(TOPICS) & set(topics.values()):
         raise ValueError(f"{path} is an MCAP file without the topics {list(TOPICS)}: not an episode of this project.")

@@ -32,13 +32,15 @@ class DeployViewer:
     Args:
         path: The .rrd.
         env: The task, for its model and its named points.
+        megabytes: That the file stays below, as in `RunViewer`.
         resume: Go on with a file that is there.
     """
 
-    def __init__(self, path: Path, env: ControlEnv, *, resume: bool):
+    def __init__(self, path: Path, env: ControlEnv, *, megabytes: float = 300.0, resume: bool):
         self.env, self.task = env, env.task
         model = getattr(env.backend, "model", None)
-        self.viewer = RunViewer(path, model, control_dt=env.task.control_dt, layout=layout(env), resume=resume)
+        dt, limit = env.task.control_dt, int(megabytes * 1e6)
+        self.viewer = RunViewer(path, model, control_dt=dt, layout=layout(env), limit=limit, resume=resume)
         self.limits: tuple[float, float] | None = None
 
     def episode(self, rollout: Rollout, model: WorldModel, error: Tensor, number: int, discount: float) -> None:

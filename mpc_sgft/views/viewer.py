@@ -18,6 +18,7 @@ counts episodes. Entities:
 | episodes                | outcomes in words                                                                       |
 """
 
+import math
 import struct
 import tempfile
 import warnings
@@ -50,6 +51,8 @@ class RunViewer:
         model: Drawn and moved by EpisodeView.qpos; None for a robot without a model.
         control_dt: [s] between two steps.
         layout: Camera, sizes and views.
+        limit: Bytes that the file stays below; None: no bound. Every episode is drawn until it is half full, then every
+            second one until half of the rest is used, every fourth, and so on. The others are a line of text.
         resume: Go on with a file that is there, which a killed run may have left unfinished.
 
     Raises:
@@ -64,9 +67,10 @@ class RunViewer:
         *,
         control_dt: float,
         layout: Layout = Layout(),  # noqa: B008  # immutable
+        limit: int | None = None,
         resume: bool = False,
     ) -> None:
-        self.path = Path(path)
+        self.path, self._limit = Path(path), limit
         self._model, self._layout = model, layout
         self._step, self._episode = 0, 0
         aside = self.path.with_suffix(".earlier.rrd")
@@ -95,22 +99,30 @@ class RunViewer:
             ValueError: If an array has another shape than EpisodeView says, or qpos comes without a model.
         """
         data.check()
+        if data.qpos is not None and self._robot is None:
+            raise ValueError("qpos given, but RunViewer has no model to move with it.")
         rows, last = Rows(self._recording, self._step, self._episode), self._step + data.steps
-        if data.qpos is not None:
-            if self._robot is None:
-                raise ValueError("qpos given, but RunViewer has no model to move with it.")
+        drawn = self._episode % self._every() == 0
+        if drawn and self._robot is not None and data.qpos is not None:
             self._robot.log_poses(rows.indexes(data.steps + 1), data.qpos)
-        log_episode(rows, data, self._layout)
+        if drawn:
+            log_episode(rows, data, self._layout)
         self._at(last)
         outcome = {True: "success", False: "no success", None: "ended"}[data.success]
         total = "" if data.reward is None else f", return {float(np.sum(data.reward)):.2f}"
         text = f"{self._episode}: {outcome}, {data.steps} steps{total}. {data.title}"
+        text += "" if drawn else " (not drawn: this file is bounded by log.rerun_mb)"
         level = rr.TextLogLevel.WARN if data.success is False else rr.TextLogLevel.INFO
         self._recording.log("episodes", rr.TextLog(text, level=level))
         if data.success is not None:
             self._recording.log("success", rr.Scalars(float(data.success)))
         self._step, self._episode = last + 1, self._episode + 1
         self._flush()
+
+    def _every(self) -> int:
+        """One of how many episodes is drawn now."""
+        free = 1.0 if self._limit is None else 1 - self.path.stat().st_size / self._limit
+        return 2 ** int(-math.log2(free)) if free > 2**-20 else 2**20
 
     def metrics(self, step: int, values: Mapping[str, float]) -> None:
         """Add scalars at `metrics/<name>`, at a position on the timeline `env_step` (RunViewer.env_step is now)."""

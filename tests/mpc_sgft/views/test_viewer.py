@@ -130,6 +130,24 @@ def test_everything_is_in_the_file(tmp_path, arm):
     assert len(RrdReader(tmp_path / "run.rrd").blueprints()) == 1
 
 
+def test_a_bounded_file_draws_fewer_and_fewer_episodes_and_tells_of_all(tmp_path, arm):
+    write(tmp_path / "one.rrd", arm, episodes=1)
+    write(tmp_path / "two.rrd", arm, episodes=2)
+    one, two = ((tmp_path / name).stat().st_size for name in ("one.rrd", "two.rrd"))
+    limit, path = one + 16 * (two - one), tmp_path / "run.rrd"
+    with RunViewer(path, arm, control_dt=0.2, limit=limit) as viewer:
+        for k in range(60):
+            viewer.episode(episode(arm, seed=k))
+    found = columns(path)
+    drawn = sorted(set(found["/world/trail/ee"]["episode"]))
+    steps = np.diff(drawn)
+    assert drawn[:7] == [0, 1, 2, 3, 4, 5, 6] and (np.diff(steps) >= 0).all() and {1, 2, 4} <= set(steps)
+    assert len(found["/episodes"]["env_step"]) == len(found["/success"]["env_step"]) == 60
+    assert "log.rerun_mb" in found["/episodes"]["TextLog:text"][59][0]
+    told = 60 * 4000  # [bytes] the line of each episode, and the file's own index of it
+    assert 0.7 * limit < path.stat().st_size < limit + told
+
+
 def test_the_robot_stands_where_mujoco_says(tmp_path, arm):
     data = mujoco.MjData(arm)
     view = episode(arm)
