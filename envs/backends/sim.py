@@ -65,7 +65,7 @@ class SimBackend:
         for effect in self.effects:
             effect.edit_spec(spec)
         self.model = spec.compile()
-        self.batch = _batch(self.model, num_envs, min(threads or _cores(), num_envs), physics)
+        self.batch = _batch(self.model, num_envs, min(threads or cores(), num_envs), physics)
         self.state = self.batch.bind("qpos"), self.batch.bind("qvel")
         self.qpos, self.qvel = self.state[0][:, : nominal.nq], self.state[1][:, : nominal.nv]
         self.signal, self.act = self.batch.bind("ctrl"), self.batch.bind("act")
@@ -258,7 +258,8 @@ def _batch(model: mujoco.MjModel, num_envs: int, threads: int, physics: str) -> 
     return WarpBatch(model, num_envs)
 
 
-def _cores() -> int:
+def cores() -> int:
+    """How many cores this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 

@@ -74,6 +74,7 @@ class Agent:
         entropy_coef: float,
         entropy_lr: float,
         policy_delay: int = 1,
+        td_lambda: float = 0.0,
         precision: str = "float32",
     ) -> None:
         if not 0 <= discount <= 1 or not 0 < rho <= 1:
@@ -83,8 +84,10 @@ class Agent:
         self.discount, self.rho, self.grad_clip, self.target_rate = discount, rho, grad_clip, target_rate
         if policy_delay < 1:
             raise ValueError(f"policy_delay must be 1 or more updates, got {policy_delay}.")
+        if not 0 <= td_lambda <= 1:
+            raise ValueError(f"td_lambda must lie in [0, 1], got {td_lambda}.")
         self.lr, self.encoder_lr_share, self.entropy_lr = lr, encoder_lr_share, entropy_lr
-        self.policy_delay, self.updates = policy_delay, 0
+        self.policy_delay, self.td_lambda, self.updates = policy_delay, td_lambda, 0
         self._watch = FiniteWatch()
         self.weights = {
             "consistency_loss": consistency_weight,
@@ -150,7 +153,7 @@ class Agent:
                 target_q = model.q(encoded, action, target=True)
                 pair = target_q[self._two_heads()]
             q_target = model.two_hot.encode(
-                losses.td_target(data.reward, data.terminated, pair[:, 1:], self.discount)
+                losses.td_target(data.reward, data.terminated, pair[:, 1:], self.discount, self.td_lambda)
             )  # [T, B, bins]
             v_target = model.two_hot.encode(losses.value_target(target_q, ended))
             r_target = model.two_hot.encode(data.reward)
@@ -253,7 +256,7 @@ class Agent:
         command_lr: float | None = None,
         following: tuple[str, ...] = (),
     ) -> None:
-        """End pretraining: freeze everything but some parts, and start fresh optimisers.
+        """End pretraining: freeze everything but some parts, and start fresh optimisers and TD-MPC2's own targets.
 
         Args:
             parts: Of the model, dotted names such as `dynamics.residual`; they train by gradient.
@@ -263,6 +266,7 @@ class Agent:
             following: Parts that updates change without a gradient.
         """
         self.pretraining, self.trainable = False, (*parts, *following)
+        self.policy_delay, self.td_lambda = 1, 0.0
         self.model.requires_grad_(False)
         for part in parts:
             self.model.get_submodule(part).requires_grad_(True)

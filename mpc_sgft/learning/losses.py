@@ -39,15 +39,30 @@ def two_hot_loss(logits: Tensor, target: Tensor) -> Tensor:
     return loss.reshape(logits.shape[:-1])
 
 
-def td_target(reward: Tensor, terminated: Tensor, next_q: Tensor, discount: float) -> Tensor:
-    """y = r + gamma (1 - terminated) min_e Q_e(z', pi(z')); a truncated step bootstraps, a terminated one does not.
+def td_target(reward: Tensor, terminated: Tensor, next_q: Tensor, discount: float, td_lambda: float = 0.0) -> Tensor:
+    """TD(lambda) within the slice; a truncated step bootstraps, a terminated one does not.
+
+        y_t = r_t + gamma (1 - terminated_t) ((1 - lambda) v_{t+1} + lambda y_{t+1}),   y_T = v_T
+        v = min_e Q_e(z', pi(z'))
+
+    lambda 0 is TD-MPC2's one-step target. More brings rewards to earlier states in fewer updates, and judges in part
+    the recorded actions instead of the policy's.
 
     Args:
         reward: [T, B].
         terminated: Bool, [T, B].
         next_q: Two target critics at the next latent and the policy's action, [2, T, B].
+        discount: gamma.
+        td_lambda: lambda, 0 to 1.
+
+    Source: Sutton and Barto, Reinforcement Learning, 2018, section 12.1.
     """
-    return reward + discount * torch.where(terminated, 0.0, next_q.amin(0))
+    values = next_q.amin(0)
+    targets, later = [], values[-1]
+    for r, ended, value in zip(reward.flip(0), terminated.flip(0), values.flip(0), strict=True):
+        later = r + discount * torch.where(ended, 0.0, torch.lerp(value, later, td_lambda))
+        targets.append(later)
+    return torch.stack(targets[::-1])
 
 
 def value_target(q: Tensor, terminated: Tensor) -> Tensor:

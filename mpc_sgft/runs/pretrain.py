@@ -1,15 +1,19 @@
 """The pretraining loop: collect a round of randomised episodes, learn from the buffer, measure, save."""
 
 import json
+import resource
 import signal
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
+import torch
 from hydra.utils import instantiate
 from omegaconf import DictConfig
 
+from envs.backends.sim import cores
 from envs.env import ControlEnv
 from mpc_sgft.command.errors import Stopped, UserError, from_config
 from mpc_sgft.learning.agent import Agent
@@ -120,9 +124,11 @@ def pretrain(cfg: DictConfig) -> int:
     bar.close()
     final_judge = build.make_env(cfg, cfg.final_episodes, randomised=True)
     planner = build.make_planner(cfg, judge.action_dim)
+    torch.set_num_threads(max(cfg.torch_threads, cores()))  # nothing else works now
     with watch("evaluate"):
         final = score(collect(final_judge, prior(agent), seed=EVAL_SEED + 1))
         planned = score(collect(final_judge, planner_policy(agent.averaged, planner, cfg.seed), seed=EVAL_SEED + 1))
+    torch.set_num_threads(cfg.torch_threads)
     summary = {
         "task": cfg.chosen.task,
         "seed": cfg.seed,
@@ -135,6 +141,7 @@ def pretrain(cfg: DictConfig) -> int:
         "return": planned.episode_return,
         "unstable_episodes": state["unstable"],
         "wall_seconds": round(time.monotonic() - began, 1),
+        "peak_memory_mb": peak_memory_mb(),
         "seconds": {part: round(seconds, 1) for part, seconds in watch.spent.items()},
         "checkpoint": str(folder / "checkpoint" / "model.safetensors"),
     }
@@ -166,6 +173,13 @@ def start_agent(cfg: DictConfig, env: ControlEnv) -> Agent:
 def prior(agent: Agent) -> Act:
     """The mean action of the averaged policy prior."""
     return planner_policy(agent.averaged, PolicyPlanner(action_dim=agent.model.action_dim, horizon=1), 0)
+
+
+def peak_memory_mb() -> dict[str, int]:
+    """Most memory [MB] that this process, and the largest one that it started and that has ended, ever held."""
+    unit = 1e6 if sys.platform == "darwin" else 1e3
+    kinds = {"learner": resource.RUSAGE_SELF, "collector": resource.RUSAGE_CHILDREN}
+    return {name: round(resource.getrusage(kind).ru_maxrss / unit) for name, kind in kinds.items()}
 
 
 class Stopwatch:

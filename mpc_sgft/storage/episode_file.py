@@ -10,7 +10,8 @@
 | `/guided`     | control period  | S samples while a person moves the arm: time, qpos, qvel, force, object [S,3] m   |
 
 Messages are JSON, so Foxglove, `mcap cat` and ten lines of any language can read them. The messages of one step share
-one compressed chunk with a checksum: a step is in the file completely or not at all. Times are seconds since the episode's start.
+one compressed chunk with a checksum: a step is in the file completely or not at all. Times are seconds since the
+episode's start.
 A number that is not finite is written as null (JSON has no NaN) and read back as nan. Float32 survives the round trip
 exactly. The gap between simulation and reality is what `diagnose` has to find, so metadata that names it is refused.
 """

@@ -20,6 +20,21 @@ def test_td_target_by_hand_terminated_and_truncated():
     assert_close(losses.td_target(reward, terminated, next_q, 0.5), torch.tensor([[6.0, 1.0, 11.0]]))
 
 
+def test_td_lambda_by_hand_and_its_ends():
+    reward = torch.tensor([[1.0, 1.0], [2.0, 2.0], [4.0, 4.0]])
+    terminated = torch.tensor([[False, False], [False, True], [False, False]])
+    v = torch.tensor([[10.0, 10.0], [20.0, 20.0], [40.0, 40.0]])
+    last = 4 + 0.5 * 40.0  # 24
+    middle = 2 + 0.5 * (0.25 * 20 + 0.75 * last)  # 13.5
+    first = 1 + 0.5 * (0.25 * 10 + 0.75 * middle), 1 + 0.5 * (0.25 * 10 + 0.75 * 2.0)  # the second one ended
+    found = losses.td_target(reward, terminated, torch.stack([v, v + 1]), 0.5, td_lambda=0.75)
+    assert_close(found, torch.tensor([first, (middle, 2.0), (last, last)]))
+    whole = losses.td_target(reward, terminated, torch.stack([v, v]), 0.5, td_lambda=1.0)
+    assert whole[0, 0] == 1 + 0.5 * (2 + 0.5 * last)  # rewards to the slice's end, and one value there
+    one_step = losses.td_target(reward, terminated, torch.stack([v, v]), 0.5)
+    assert_close(one_step, reward + 0.5 * torch.where(terminated, 0.0, v))
+
+
 def test_a_terminal_state_is_worth_nothing_whatever_the_critic_says():
     q = torch.tensor([[[4.0, torch.nan]], [[8.0, torch.nan]]])
     assert_close(losses.value_target(q, torch.tensor([[False, True]])), torch.tensor([[6.0, 0.0]]))
