@@ -12,7 +12,6 @@ COMMAND = cli.Command(
     loop="mpc_sgft.runs.pretrain:pretrain",
     summary="Pretrain a latent world model, a policy prior and a critic in randomised MuJoCo simulation.\n"
     "Ctrl-C saves; --resume goes on exactly where it stopped.",
-    values={"physics": ("mujoco", "warp")},
 )
 
 

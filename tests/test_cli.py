@@ -308,11 +308,15 @@ def test_wrong_values_found_while_building_are_the_users() -> None:
     ("change", "says"),
     [
         (lambda cfg: cfg.pop("collector"), "it had no collector"),
+        (lambda cfg: cfg.pop("physics"), "it had no physics"),
+        (lambda cfg: cfg.train.agent.pop("td_lambda"), "it had no train.agent.td_lambda"),
         (
             lambda cfg: cfg.collector.update({"_target_": "mpc_sgft.gone.Process"}),
             "gone.Process has moved since",
         ),
         (lambda cfg: None, None),
+        (lambda cfg: (cfg.overrides.append("~train.agent.td_lambda"), cfg.train.agent.pop("td_lambda")), None),
+        (lambda cfg: cfg.gap.effects.update({"actuator_gain": {"gain": 0.9}}), None),
     ],
 )
 def test_a_run_of_an_earlier_version_is_refused_by_name(tmp_path, change, says):

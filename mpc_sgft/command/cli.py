@@ -95,7 +95,7 @@ def _run(command: Command, flags: argparse.Namespace, given: list[str]) -> int:
 
     from mpc_sgft.command import compose
 
-    values = {"device": ("auto", "cpu", "cuda"), **command.values}
+    values = {"device": ("auto", "cpu", "cuda"), "physics": ("mujoco", "warp"), **command.values}
     given = compose.spread(given)
     overrides = [compose.normalise(text) for text in given]
     if flags.multirun:

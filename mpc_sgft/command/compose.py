@@ -201,7 +201,9 @@ def resume(name: str, folder: str, overrides: Sequence[str], given: Sequence[str
         wrote = cfg.get("command") if isinstance(cfg, DictConfig) else None
         raise UserError(f"cannot resume {folder} with {name}: {wrote or 'another program'} wrote it.")
     differs = [f"{t} has moved since" for t in _targets(cfg) if find_spec(t.rpartition(".")[0]) is None]
-    differs += [f"it had no {group}" for group in choices.groups_of(name) if group not in ("experiment", *cfg)]
+    taken_out = tuple(text[1:].partition("=")[0] for text in cfg.overrides if text.startswith("~"))
+    lacking = (key for key in _lacking(_of_today(name, cfg), cfg) if not key.startswith(taken_out))
+    differs += [f"it had no {key}" for key in lacking]
     if differs:
         raise UserError(
             f"cannot resume {folder}: an earlier version wrote it ({differs[0]}). "
@@ -281,6 +283,26 @@ def _targets(node: Any) -> list[str]:
         inner = [target for key in node if not OmegaConf.is_missing(node, key) for target in _targets(node[key])]
         return [here, *inner] if isinstance(here, str) and here.startswith("mpc_sgft.") else inner
     return []
+
+
+def _of_today(name: str, cfg: DictConfig) -> DictConfig:
+    """What a command's config has now with the choices of a saved one; their gap is a list of its own."""
+    groups = choices.groups_of(name)
+    chosen = {group: option for group, option in cfg.chosen.items() if option in groups.get(group, ())}
+    kept = [f"{group}={option}" for group, option in chosen.items() if group not in ("gap", "experiment")]
+    return _compose(name, kept)
+
+
+def _lacking(today: DictConfig, cfg: DictConfig, before: str = "") -> list[str]:
+    """Settings of today's config that a saved one has not."""
+    out = []
+    for key in (str(key) for key in today if key != "hydra"):
+        if key not in cfg:
+            out.append(before + key)
+        elif not OmegaConf.is_missing(today, key) and isinstance(OmegaConf.select(today, key), DictConfig):
+            there = cfg[key]
+            out += _lacking(today[key], there, f"{before}{key}.") if isinstance(there, DictConfig) else []
+    return out
 
 
 def _values(override: Override) -> list[str]:

@@ -3,36 +3,20 @@
 import copy
 import hashlib
 from collections.abc import Callable, Mapping
-from functools import wraps
-from typing import Any, Concatenate, ParamSpec, TypeVar, cast
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from torch.optim.swa_utils import AveragedModel
 
 from mpc_sgft.learning import losses
-from mpc_sgft.learning.layers import products_in
-from mpc_sgft.learning.precision import dtype_of_products
-from mpc_sgft.learning.slices import FiniteWatch, Slices, arranged, check_finite, to_slices
+from mpc_sgft.learning.averaged import AveragedWeights
+from mpc_sgft.learning.precision import dtype_of_products, in_own_precision
+from mpc_sgft.learning.slices import FiniteWatch, Slices, arranged, check_finite, floats, to_slices
 from mpc_sgft.learning.world_model import WorldModel
 
 PRETRAINED = ("encoder", "dynamics", "reward_head", "q_ensemble", "value_head", "policy_head", "decoder")
 FOLLOWING = ("normalizer", "target_q")  # not by gradient
-
-P = ParamSpec("P")
-R = TypeVar("R")
-
-
-def _in_own_precision(method: Callable[Concatenate["Agent", P], R]) -> Callable[Concatenate["Agent", P], R]:
-    """Run a method of the agent with the matrix products of its `precision`."""
-
-    @wraps(method)
-    def within(self: "Agent", *args: P.args, **kwargs: P.kwargs) -> R:
-        with products_in(self.products):
-            return method(self, *args, **kwargs)
-
-    return within
 
 
 class Agent:
@@ -102,7 +86,7 @@ class Agent:
         self._host_generator = self.generator if on_host else torch.Generator().manual_seed(seed)
         self.scale = losses.RunningScale(scale_rate, self.device)
         self.log_entropy_coef = torch.tensor(entropy_coef, device=self.device).log().requires_grad_()
-        self._averaged, self.average_decay = AveragedModel(self.model), average_decay
+        self._averaged = AveragedWeights(self.model, average_decay)
         self.pretraining, self.imagined_steps = True, 0
         self.trainable: tuple[str, ...] = (*PRETRAINED, *FOLLOWING)
         self._make_optimizers(lr, lr, lr)
@@ -110,7 +94,7 @@ class Agent:
     @property
     def averaged(self) -> WorldModel:
         """The model with its weights averaged over the last updates of pretraining: what is evaluated and saved."""
-        return cast(WorldModel, self._averaged.module)
+        return self._averaged.model
 
     def scale_learning_rates(self, share: float) -> None:
         """Set the pretraining learning rates to a share of the configured ones."""
@@ -125,7 +109,7 @@ class Agent:
 
     # -- learning in simulation ----------------------------------------------------------------------------------------
 
-    @_in_own_precision
+    @in_own_precision
     def update(self, batch: TensorDictBase, *, read: bool = True) -> dict[str, float]:
         """One step of the TD-MPC2 objective with a value head, on slices [B, T]; returns metrics.
 
@@ -145,26 +129,17 @@ class Agent:
         first_z = model.encode(data.observation[0])  # [B, D], trains the encoder
         with torch.no_grad():
             encoded = torch.cat([first_z.unsqueeze(0), model.encode(data.observation[1:])])  # [T + 1, B, D]
-            ended = torch.cat([torch.zeros_like(data.terminated[:1]), data.terminated])  # [T + 1, B]
-            action, _ = model.policy(encoded, self._noise(*encoded.shape[:-1]))
-            if model.num_q == 2:
-                target_q = pair = model.q(encoded, action, target=True)  # [E, T + 1, B]
-            else:
-                target_q = model.q(encoded, action, target=True)
-                pair = target_q[self._two_heads()]
-            q_target = model.two_hot.encode(
-                losses.td_target(data.reward, data.terminated, pair[:, 1:], self.discount, self.td_lambda)
-            )  # [T, B, bins]
-            v_target = model.two_hot.encode(losses.value_target(target_q, ended))
-            r_target = model.two_hot.encode(data.reward)
+        noise = self._noise(*encoded.shape[:-1])
+        heads = None if model.num_q == 2 else self._two_heads()
+        target = losses.targets(model, encoded, data, noise, heads, self.discount, self.td_lambda)
 
         zs = self._imagine(first_z, data.action)  # [T + 1, B, D]
         q_logits = model.q_logits(zs[:-1], data.action)  # [E, T, B, bins]
         per_step = {
             "consistency_loss": losses.consistency_loss(zs[1:], encoded[1:]),
-            "reward_loss": losses.two_hot_loss(model.reward_logits(zs[:-1], data.action, zs[1:]), r_target),
-            "q_loss": losses.two_hot_loss(q_logits, q_target.expand_as(q_logits)).mean(0),
-            "value_loss": losses.two_hot_loss(model.value_head(zs.detach()), v_target),
+            "reward_loss": losses.two_hot_loss(model.reward_logits(zs[:-1], data.action, zs[1:]), target.reward),
+            "q_loss": losses.two_hot_loss(q_logits, target.q.expand_as(q_logits)).mean(0),
+            "value_loss": losses.two_hot_loss(model.value_head(zs.detach()), target.value),
         }
         if policy_too:
             per_step["decoder_loss"] = self._decoder_loss(encoded, data.observation)
@@ -184,20 +159,10 @@ class Agent:
             )
         model.update_targets(self.target_rate)
         if self.pretraining:
-            self._average()
+            self._averaged.follow(model)
         self.updates += 1
-        metrics["target_value"] = target_q.mean()
+        metrics["target_value"] = target.mean
         return floats(metrics) if read else {}
-
-    @torch.no_grad()
-    def _average(self) -> None:
-        """The averaged weights follow; `AveragedModel.update_parameters` would wait for the device."""
-        kept, model = self._averaged, self.model
-        share = 1 - self.average_decay if self.updates else 1.0
-        torch._foreach_lerp_([*kept.module.parameters()], [*model.parameters()], share)  # type: ignore
-        for there, here in zip(kept.module.buffers(), model.buffers(), strict=True):
-            there.copy_(here)
-        kept.n_averaged += 1
 
     def _note(self, values: Mapping[str, Tensor], check: bool) -> None:
         self._watch.note(values)
@@ -279,7 +244,7 @@ class Agent:
         modules = (dynamics.base, dynamics.residual)
         return [p for module in modules if module for p in module.parameters() if p.requires_grad]
 
-    @_in_own_precision
+    @in_own_precision
     def fit_dynamics(
         self,
         data: Slices,
@@ -318,7 +283,7 @@ class Agent:
         self.model_optimizer.step()
         return metrics, encoded
 
-    @_in_own_precision
+    @in_own_precision
     def climb(self, starts: Tensor, *, horizon: int, entropy_coef: float) -> dict[str, Tensor]:
         """A step of the policy prior up the SGFT objective of `horizon` imagined steps from latents [B, D]."""
         return self._climb(starts, horizon, entropy_coef, read=True)[0]
@@ -429,9 +394,3 @@ class Agent:
 
     def _two_heads(self) -> list[int]:
         return torch.randperm(self.model.num_q, generator=self._host_generator)[:2].tolist()
-
-
-def floats(metrics: Mapping[str, Tensor]) -> dict[str, float]:
-    """Scalars as Python numbers, in one transfer from the device."""
-    values = torch.stack([m.detach().float() for m in metrics.values()]).tolist()
-    return dict(zip(metrics, values, strict=True))

@@ -7,10 +7,14 @@ Source: TD-MPC2, arXiv:2310.16828; entropy coefficient: SAC, arXiv:1812.05905; t
 ICLR 2025).
 """
 
+from collections.abc import Sequence
+from typing import NamedTuple
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from mpc_sgft.learning.slices import Slices
 from mpc_sgft.learning.world_model import WorldModel
 
 
@@ -73,6 +77,44 @@ def value_target(q: Tensor, terminated: Tensor) -> Tensor:
         terminated: Bool, [T, B]: the latent belongs to a terminal state, whose value is zero by definition.
     """
     return torch.where(terminated, 0.0, q.mean(0))
+
+
+class Targets(NamedTuple):
+    """What critics, V and reward are trained toward, two-hot."""
+
+    q: Tensor  # [T, B, bins]
+    value: Tensor  # [T + 1, B, bins]
+    reward: Tensor  # [T, B, bins]
+    mean: Tensor  # of the target critics, reward units, scalar
+
+
+@torch.no_grad()
+def targets(
+    model: WorldModel,
+    encoded: Tensor,
+    data: Slices,
+    noise: Tensor,
+    heads: Sequence[int] | None,
+    discount: float,
+    td_lambda: float,
+) -> Targets:
+    """`td_target` and `value_target` from the target critics at the policy's actions.
+
+    Args:
+        model: What is trained.
+        encoded: Latents of the observations, [T + 1, B, D].
+        data: The slices.
+        noise: Of the policy's actions, [T + 1, B, A].
+        heads: The two critics whose minimum is taken; None: there are two.
+        discount, td_lambda: As in `td_target`.
+    """
+    ended = torch.cat([torch.zeros_like(data.terminated[:1]), data.terminated])  # [T + 1, B]
+    q = model.q(encoded, model.policy(encoded, noise)[0], target=True)  # [E, T + 1, B]
+    pair = q if heads is None else q[list(heads)]
+    towards = td_target(data.reward, data.terminated, pair[:, 1:], discount, td_lambda)
+    value = value_target(q, ended)
+    encode = model.two_hot.encode
+    return Targets(encode(towards), encode(value), encode(data.reward), q.mean())
 
 
 def policy_loss(q: Tensor, log_prob: Tensor, entropy_coef: Tensor | float, scale: Tensor | float) -> Tensor:

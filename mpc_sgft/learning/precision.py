@@ -1,10 +1,13 @@
 """In which precision the matrix products of plans and updates run."""
 
 import warnings
-from functools import cache
+from collections.abc import Callable
+from functools import cache, wraps
+from typing import Concatenate, ParamSpec, Protocol, TypeVar
 
 import torch
 
+from mpc_sgft.learning.layers import products_in
 from planners.base import PRECISIONS
 
 WIDE = 256  # hidden units from which bfloat16 products save more than rounding costs
@@ -46,3 +49,25 @@ def _warn_once() -> None:
         "take about three times as long. Use precision=auto or float32.",
         stacklevel=3,
     )
+
+
+class HasProducts(Protocol):
+    """Whatever has matrix products of a type of its own."""
+
+    products: torch.dtype
+
+
+P = ParamSpec("P")
+R = TypeVar("R")
+S = TypeVar("S", bound=HasProducts)
+
+
+def in_own_precision(method: Callable[Concatenate[S, P], R]) -> Callable[Concatenate[S, P], R]:
+    """Run a method with the matrix products of `Linear` in the type that `self.products` says."""
+
+    @wraps(method)
+    def within(self: S, *args: P.args, **kwargs: P.kwargs) -> R:
+        with products_in(self.products):
+            return method(self, *args, **kwargs)
+
+    return within

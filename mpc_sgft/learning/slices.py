@@ -66,3 +66,9 @@ class FiniteWatch:
         bad = [name for name, ok in zip(noted, finite, strict=True) if not ok]
         if bad:
             raise FloatingPointError(f"{', '.join(bad)} is not finite in an update.")
+
+
+def floats(metrics: Mapping[str, Tensor]) -> dict[str, float]:
+    """Scalars as Python numbers, in one transfer from the device."""
+    values = torch.stack([m.detach().float() for m in metrics.values()]).tolist()
+    return dict(zip(metrics, values, strict=True))

@@ -64,8 +64,8 @@ def make_env(
             draws = randomize.load(OmegaConf.to_container(cfg.randomize.draws, resolve=True))  # type: ignore[arg-type]
             noise = {"noise_sd": cfg.randomize.noise_sd, "noise_probability": cfg.randomize.noise_probability}
     with from_config("gap"):
-        physics = cfg.get("physics", "mujoco")
-        backend = SimBackend(task, num_envs, effects=present, draws=draws, threads=threads, physics=physics, **noise)
+        how = {"threads": threads, "physics": cfg.physics, **noise}
+        backend = SimBackend(task, num_envs, effects=present, draws=draws, **how)
     return ControlEnv(backend, history=cfg.task.history)
 
 

@@ -101,7 +101,7 @@ class Deployment:
         self.verdicts = Verdicts(self, ask=person.asks(cfg))
         self.stop = StopRequest("rollout")
         self.viewer = (
-            DeployViewer(self.folder / "run.rrd", env, megabytes=cfg.log.get("rerun_mb", 300), resume=bool(cfg.resume))
+            DeployViewer(self.folder / "run.rrd", env, megabytes=cfg.log.rerun_mb, resume=bool(cfg.resume))
             if cfg.log.rerun
             else None
         )

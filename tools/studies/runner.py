@@ -28,7 +28,7 @@ def finished(command: str, folder: Path, overrides: Sequence[str], launcher: str
         command: Which.
         folder: The run folder; with a launcher, where the other machines see it too.
         overrides: Of the run, and of the launcher.
-        launcher: A Hydra launcher that starts the run elsewhere; None: here. What it was cut off is not resumed.
+        launcher: A Hydra launcher that starts the run elsewhere; None: here. It does not resume what was cut off.
 
     Raises:
         RunFailed: If the command does.

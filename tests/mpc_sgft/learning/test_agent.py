@@ -5,6 +5,7 @@ import copy
 import pytest
 import torch
 from tensordict import TensorDict
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from torch.testing import assert_close
 from torch.utils._python_dispatch import TorchDispatchMode
 
@@ -353,6 +354,17 @@ def test_an_update_that_is_not_read_is_the_same_update_and_what_was_not_finite_s
     unread.update(batch, read=False)
     with pytest.raises(FloatingPointError, match="^reward is not finite"):
         unread.update(make_batch())
+
+
+def test_the_averaged_weights_are_those_of_torchs_own_average():
+    agent = make_agent(average_decay=0.7)
+    theirs = AveragedModel(agent.model, multi_avg_fn=get_ema_multi_avg_fn(0.7))
+    for i in range(4):
+        agent.update(make_batch(i))
+        theirs.update_parameters(agent.model)
+    found, wanted = agent.averaged.state_dict(), theirs.module.state_dict()
+    assert all(torch.equal(found[name], x) for name, x in wanted.items() if "normalizer" not in name)
+    assert torch.equal(found["normalizer.mean"], agent.model.normalizer.mean)
 
 
 def test_with_a_delay_the_policy_and_the_decoder_learn_in_every_second_update():

@@ -11,7 +11,7 @@ def test_shaped_rewards_telescope():
     steps, discount = 5, 0.9
     reward, value = torch.randn(steps, dtype=torch.float64), torch.randn(steps + 1, dtype=torch.float64)
     shaped = shape_reward(reward, value[:-1], value[1:], torch.zeros(steps, dtype=torch.bool), discount)
-    weights = discount ** torch.arange(steps)
+    weights = discount ** torch.arange(steps, dtype=reward.dtype)  # of whole numbers they would be float32
     h_step_return = (weights * reward).sum() + discount**steps * value[-1]
     assert_close((weights * shaped).sum(), h_step_return - value[0])
 

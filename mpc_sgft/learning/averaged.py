@@ -1,0 +1,40 @@
+"""The average of a model's weights over its last updates: what is evaluated and saved."""
+
+import copy
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+
+from mpc_sgft.learning.world_model import WorldModel
+
+
+class AveragedWeights:
+    """average += (1 - decay) (weights - average) at each update, from the first one's weights on; buffers are copied.
+
+    The numbers of `torch.optim.swa_utils.AveragedModel` with an exponential average, but the host need not wait for the
+    device.
+
+    Args:
+        model: Whose weights.
+        decay: 0…1.
+    """
+
+    def __init__(self, model: WorldModel, decay: float) -> None:
+        self.model, self.decay, self.updates = copy.deepcopy(model), decay, 0
+
+    @torch.no_grad()
+    def follow(self, model: WorldModel) -> None:
+        """Take in the weights after an update."""
+        share = 1 - self.decay if self.updates else 1.0
+        torch._foreach_lerp_([*self.model.parameters()], [*model.parameters()], share)  # type: ignore
+        for there, here in zip(self.model.buffers(), model.buffers(), strict=True):
+            there.copy_(here)
+        self.updates += 1
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"model": self.model.state_dict(), "updates": self.updates}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        self.model.load_state_dict(state["model"])
+        self.updates = state["updates"]
