@@ -27,7 +27,12 @@ def on_pre_build(config: Any) -> None:
 def on_page_markdown(markdown: str, **_: Any) -> str:
     """Fill the places that are marked {{ so }}."""
     fills = {"results": results_page.page, "ablation": results_page.STUDIES["ablation"]}
-    fills |= {"collect": results_page.collect, "thousand": results_page.thousand, "settings": settings}
+    fills |= {
+        "collect": results_page.collect,
+        "growth": results_page.growth,
+        "thousand": results_page.thousand,
+        "settings": settings,
+    }
     for name, fill in {**fills, "effects": effects}.items():
         mark = "{{ " + name + " }}"
         if mark in markdown:

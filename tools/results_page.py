@@ -152,6 +152,13 @@ def collect() -> str:
     return pick(read("scale/time_collect.csv"), {**head, "bytes a transition": "bytes_per_step"})
 
 
+def growth() -> str:
+    """Plans by what they search, start-up times, and bytes of a rollout."""
+    head: dict[str, str | tuple[str, Callable[[str], str]]]
+    head = {"what": "what", "": "value", "takes": "amount", "unit": "unit", "to the default": "ratio"}
+    return pick(read("scale/cost_growth.csv"), head)
+
+
 def quality() -> str:
     rows = [{**r, "variant": r["variant"] or "as configured"} for r in read("plan_quality/plan_quality.csv")]
     head: dict[str, str | tuple[str, Callable[[str], str]]] = {"gap": "gap", "search": "variant"}
@@ -216,7 +223,7 @@ STUDIES: dict[str, Callable[[], str]] = {
     "stability": lambda: records("stability/stability.json"),
     "timing": timing,
     "plan_quality": quality,
-    "scale": collect,
+    "scale": lambda: collect() + "\n\n" + growth(),
 }
 
 
