@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
+IDLE = 1e-6  # of the forces that a joint moves by: an actuator that never gave more did nothing
+
 
 class TypicalSizes(NamedTuple):
     """Typical sizes at one place: what "large" means there."""
@@ -20,6 +22,11 @@ class TypicalSizes(NamedTuple):
     mass: float = 1.0  # kg of the body
     friction: float = 1.0  # sliding friction of the geom's contacts
     dt: float = 0.001  # s between samples
+
+    @property
+    def idle(self) -> bool:
+        """Whether an actuator does nothing in the measured motion."""
+        return self.peak <= IDLE * self.force
 
 
 class Parameter(NamedTuple):
@@ -38,6 +45,7 @@ class EffectFacts(NamedTuple):
 
     parameters: Mapping[str, Parameter]
     driven: bool = False  # only where a motor sits
+    commanded: bool = False  # only where that motor does something
     sums: Mapping[str, tuple[str, str]] = {}  # the effect's parameter -> fitted ones that it is the sum of
     variants: Sequence[Mapping[str, float]] = ({},)  # parameters that are held, one candidate each
 
@@ -83,17 +91,22 @@ TABLE: dict[str, EffectFacts] = {
         {"coefficient": Parameter(lambda s: s.friction, lambda s: 0.5 * s.friction, (-0.5, 0.5, 2.0), -2.0, 10.0)}
     ),
     "contact_softness": EffectFacts({"time_constant": Parameter(0.0, lambda s: 0.02, (0.25, 1.0), 0.0, 45.0)}),
-    "actuator_gain": EffectFacts({"gain": Parameter(1.0, lambda s: 1.0, (-0.1, 0.1), -0.95, 2.0)}),
+    "actuator_gain": EffectFacts({"gain": Parameter(1.0, lambda s: 1.0, (-0.1, 0.1), -0.95, 2.0)}, commanded=True),
     "actuator_offset": EffectFacts({"offset": Parameter(0.0, lambda s: s.command, (0.05, -0.05))}),
-    "deadband": EffectFacts({"width": Parameter(0.0, lambda s: s.command, (0.05, 0.3), 0.0, 3.0)}),
+    "deadband": EffectFacts({"width": Parameter(0.0, lambda s: s.command, (0.05, 0.3), 0.0, 3.0)}, commanded=True),
     "torque_saturation": EffectFacts(
-        {"limit": Parameter(lambda s: s.peak, lambda s: s.peak, (-0.15, -0.5, -0.75, -0.88, _saturated), -0.999, 0.0)}
+        {"limit": Parameter(lambda s: s.peak, lambda s: s.peak, (-0.15, -0.5, -0.75, -0.88, _saturated), -0.999, 0.0)},
+        commanded=True,
     ),
     "sensor_offset": EffectFacts({"offset": Parameter(0.0, lambda s: s.travel, (0.1, -0.1), -3.0, 3.0)}),
     "sensor_gain": EffectFacts({"gain": Parameter(1.0, lambda s: 1.0, (-0.05, 0.05), -0.8, 2.0)}),
-    "actuator_delay": EffectFacts({"delay": Parameter(0.0, lambda s: 0.02, (0.25, 1.0), 0.0, 15.0, lambda s: s.dt)}),
+    "actuator_delay": EffectFacts(
+        {"delay": Parameter(0.0, lambda s: 0.02, (0.25, 1.0), 0.0, 15.0, lambda s: s.dt)}, commanded=True
+    ),
     "sensor_delay": EffectFacts({"delay": Parameter(0.0, lambda s: 0.02, (0.25, 1.0), 0.0, 15.0)}),
-    "actuator_lag": EffectFacts({"time_constant": Parameter(0.0, lambda s: 0.02, (0.25, 1.0), 0.0, 15.0)}),
+    "actuator_lag": EffectFacts(
+        {"time_constant": Parameter(0.0, lambda s: 0.02, (0.25, 1.0), 0.0, 15.0)}, commanded=True
+    ),
 }
 
 # richer effect -> simpler one -> {parameter of the richer: parameter of the simpler that gives the same physics}

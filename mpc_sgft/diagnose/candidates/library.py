@@ -95,6 +95,8 @@ def candidates(
     for name in (n for n in known if effects is None or n in effects):
         kind, facts = effect_class(name).place, _facts_of(name)
         for place in driven if facts.driven else places[kind]:
+            if facts.commanded and scales.get((kind, place), TypicalSizes()).idle:
+                continue
             variants = load_positions(plant, place) if name == "payload" else facts.variants
             built += [
                 make_term(plant, name, place, scales.get((kind, place), TypicalSizes()), fixed) for fixed in variants
@@ -104,6 +106,8 @@ def candidates(
             what = (
                 "geoms that touch while the machine moves" if effect_class(name).place == "geom" else "a driven joint"
             )
+            if _facts_of(name).commanded:
+                what = "an actuator that does something in these data"
             raise UserError(f"--effects {name}: it needs {what}, and here there are none; leave it out.")
     return built
 

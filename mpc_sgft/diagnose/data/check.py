@@ -68,7 +68,7 @@ def episodes(
     check_speeds(table, joints)
     check_order(table, servos or {})
     notes = tuple(f"{table.name}: {what}" for what in (table.lost, strange) if what)
-    if all(np.ptp(columns[f"ctrl/{a}"]) == 0 for a in actuators):
+    if actuators and all(np.ptp(columns[f"ctrl/{a}"]) == 0 for a in actuators):
         notes += (f"{table.name}: the commands are constant: what acts on commands cannot show here",)
     cuts = np.flatnonzero(steps > GAP * dt) + 1
     pieces = [p for p in np.split(np.arange(len(time)), cuts) if len(p) >= MIN_SAMPLES]
@@ -99,7 +99,7 @@ def _names(table: Table, actuators: Sequence[str], joints: Sequence[str]) -> str
         hints = [f"{name} (nearest: {match[0]})" if match else name for name, match in near.items()]
         raise UserError(
             f"{table.name}: columns missing: {', '.join(hints)}. The file has: {', '.join(has)}. "
-            f"The model has the actuators {', '.join(actuators)} and the joints {', '.join(joints)}."
+            f"The model has the actuators {', '.join(actuators) or '(none)'} and the joints {', '.join(joints)}."
         )
     for kind, known in (("ctrl", actuators), ("force", actuators), ("qvel", joints)):
         for name in has:
@@ -115,8 +115,8 @@ def _names(table: Table, actuators: Sequence[str], joints: Sequence[str]) -> str
 
 def _moves(table: Table, actuators: Sequence[str], joints: Sequence[str]) -> None:
     still = all(np.ptp(table.columns[f"qpos/{j}"]) == 0 for j in joints)
-    constant = all(np.ptp(table.columns[f"ctrl/{a}"]) == 0 for a in actuators)
     if still:
+        constant = all(np.ptp(table.columns[f"ctrl/{a}"]) == 0 for a in actuators)
         what = "and the commands are constant too" if constant else "although the commands change"
         raise UserError(f"{table.name}: no joint moves, {what}. Record motion: nothing can be learned from this.")
 

@@ -292,7 +292,8 @@ def typical_sizes(plant: Plant, replayer: Replayer) -> dict[tuple[str, str], Typ
         command = float(np.sqrt(np.mean(u[:, i] ** 2))) + 1e-9
         most = float(peak[i]) + 1e-9
         ask = float(needed[m.joint(joint).dofadr[0]] / abs(m.actuator(name).gear[0])) if joint else most
-        out["actuator", name] = at._replace(command=command, peak=most, needed=ask)
+        at = at._replace(command=command, peak=most, needed=ask)
+        out["actuator", name] = at._replace(command=ask) if at.idle else at
     for name in plant.bodies:
         out["body", name] = TypicalSizes(mass=float(m.body_mass[m.body(name).id]), dt=dt)
     for name, friction in touching.items():

@@ -96,8 +96,8 @@ class Plant:
                 objname=actuator.name,
             )
         self.model = self.spec.compile()
-        if not self.model.nu or not self.model.nv:
-            raise UserError("the model has no actuator or no joint: there is nothing to compare with measurements.")
+        if not self.model.nv:
+            raise UserError("the model has no joint: there is nothing to compare with measurements.")
         if any(t not in SCALAR for t in self.model.jnt_type):
             free = [self.model.joint(i).name for i in range(self.model.njnt) if self.model.jnt_type[i] not in SCALAR]
             raise UserError(f"joint {free[0]!r} is free or a ball: only hinges and slides can be compared with --data.")
