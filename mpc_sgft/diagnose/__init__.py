@@ -36,6 +36,8 @@ def diagnose(
     uncertain: Mapping[str, float] | None = None,
     seed: int = 0,
     max_effects: int = 3,
+    tolerance: float | Mapping[str, float | str] | None = None,
+    traces: bool = False,
     progress: bool = False,
 ) -> Report:
     """Compare a model with measurements and say what it lacks.
@@ -43,7 +45,8 @@ def diagnose(
     Args:
         model: MJCF file, spec, or the model that was compiled last.
         data: Episode files (CSV, Parquet, MCAP) and folders of them.
-        out: Folder for report.json, report.html, report.rrd, repaired.xml and effects.yaml; nothing is written if None.
+        out: Folder for report.json, report.html, report.rrd, and where the error on windows that were never fitted
+            credibly falls, repaired.xml and effects.yaml; nothing is written if None.
         effects: Names of the only effects to consider; all that the data can show if None.
         signals: Compared columns, such as `qpos/elbow`; all positions and measured forces if None.
         window: Length of a simulated window [s]; chosen from the data if None.
@@ -52,6 +55,10 @@ def diagnose(
             wrong. They are refitted in the baseline and in every candidate.
         seed: Of the bootstrap and the residual model.
         max_effects: Largest set of effects.
+        tolerance: Prediction error that does not matter: a share of each signal's standard deviation, or signal ->
+            number in its unit or with a unit of its own ("0.5mm"), and then other signals do not count. If None,
+            whatever takes away a hundredth of the squared error matters.
+        traces: Whether repaired.xml and effects.yaml hold effects that are there and do not matter, too.
         progress: Show a progress bar on stderr.
 
     Raises:
@@ -72,5 +79,7 @@ def diagnose(
         uncertain=uncertain or {},
         seed=seed,
         max_effects=max_effects,
+        tolerance=tolerance,
+        traces=traces,
         progress=progress,
     )

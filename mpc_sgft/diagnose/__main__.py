@@ -36,6 +36,12 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--uncertain", metavar="Q=SHARE,...", help="nominal quantities that may be wrong, mass=0.3,gain=0.2")
     p.add_argument("--seed", type=int, default=0, metavar="N")
     p.add_argument("--max-effects", type=int, default=3, metavar="N", help="largest set of effects; default 3")
+    p.add_argument(
+        "--tolerance",
+        metavar="SHARE|Q=SIZE,...",
+        help="prediction error that does not matter: a share of the motion, 1%%, or by signal, qpos/elbow=0.1deg",
+    )
+    p.add_argument("--traces", action="store_true", help="repair what is there and does not matter, too")
     return p
 
 
@@ -86,6 +92,8 @@ def _run(args: argparse.Namespace) -> int:
         uncertain=_shares(args.uncertain),
         seed=args.seed,
         max_effects=args.max_effects,
+        tolerance=_tolerance(args.tolerance),
+        traces=args.traces,
         progress=True,
     )
     print(report.summary())
@@ -118,6 +126,8 @@ def _run_folder(args: argparse.Namespace) -> int:
         held_out=_held_out(args.held_out),
         seed=args.seed,
         max_effects=args.max_effects,
+        tolerance=_tolerance(args.tolerance),
+        traces=args.traces,
         progress=True,
     )
     print(report.summary())
@@ -125,10 +135,10 @@ def _run_folder(args: argparse.Namespace) -> int:
     if args.retrain:
         import yaml
 
-        effects = yaml.safe_load((out / "effects.yaml").read_text())["effects"]
-        if not effects:
-            print("nothing to retrain on: no effect was found")
+        if report.data["effects_file"] is None:
+            print("nothing to retrain on: nothing was found that brings simulation nearer to the recordings")
             return 0
+        effects = yaml.safe_load((out / report.data["effects_file"]).read_text())["effects"]
         print(table(retrain(args.run, effects, out, args.retrain_transitions)))
     return 0
 
@@ -142,6 +152,12 @@ def _held_out(text: str | None) -> float | list[str] | None:
         return None if text is None else float(text)
     except ValueError:
         return _names(text)
+
+
+def _tolerance(text: str | None) -> float | dict[str, str] | None:
+    from mpc_sgft.diagnose.verdict.tolerance import parse_tolerance
+
+    return None if text is None else parse_tolerance(text)
 
 
 def _shares(text: str | None) -> dict[str, float]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -20,18 +20,22 @@ from mpc_sgft.diagnose.deployments.chain import Chain, Prediction, effects_of
 from mpc_sgft.diagnose.deployments.motion_link import JOINT_SAMPLES
 from mpc_sgft.diagnose.deployments.next_recording import next_experiment
 from mpc_sgft.diagnose.deployments.recordings import Deployment, read_deployment
-from mpc_sgft.diagnose.fitting.fit import fit
+from mpc_sgft.diagnose.fitting.fit import Fit, fit
 from mpc_sgft.diagnose.fitting.hypothesis import Hypothesis
 from mpc_sgft.diagnose.fitting.prepare import Setup, leave_out_blocks, split
 from mpc_sgft.diagnose.fitting.screening import Effort
 from mpc_sgft.diagnose.fitting.search import search
 from mpc_sgft.diagnose.report import Report
-from mpc_sgft.diagnose.run import candidate_rows, effect_rows, reduction
-from mpc_sgft.diagnose.verdict.naming import Verdict, caution, reach_verdict
+from mpc_sgft.diagnose.rows import Shown, candidate_rows, effect_rows, reduction, trace_rows
+from mpc_sgft.diagnose.verdict import repair
+from mpc_sgft.diagnose.verdict.relevance import repairs
+from mpc_sgft.diagnose.verdict.tolerance import Predict, Tolerance, limits_of
+from mpc_sgft.diagnose.verdict.verdict import Verdict, reach_verdict
 from mpc_sgft.storage.metrics import progress as bar_of
 
 LENGTH = 6  # control steps in a window
 MOST = 64  # windows
+UNITS = {"observation": "of the observation", "drive": "of the control", "qpos": "rad"}
 EFFORT = Effort(beam=(2,), full=(5, 4, 3), screen_windows=16, quick_windows=16, enough=1.0, pairs=0, exchange=0)
 
 
@@ -44,6 +48,8 @@ def diagnose_run(
     held_out: float | Sequence[str] | None = None,
     seed: int = 0,
     max_effects: int = 3,
+    tolerance: float | Mapping[str, float | str] | None = None,
+    traces: bool = False,
     progress: bool = False,
 ) -> Report:
     """Say what the task's simulation lacks, from what a deployment recorded; its gap is not read.
@@ -56,6 +62,8 @@ def diagnose_run(
         held_out: Share of the episodes that is never fitted, or their names; a quarter if None.
         seed: Of the bootstrap.
         max_effects: Largest set of effects.
+        tolerance: What prediction error does not matter, as for `diagnose`.
+        traces: Whether effects.yaml and repaired.xml hold traces too.
         progress: Show a progress bar on stderr.
 
     Raises:
@@ -65,6 +73,7 @@ def diagnose_run(
     began, rng = time.perf_counter(), np.random.default_rng(seed)
     deployment = read_deployment(run)
     setup = prepare(deployment, window, held_out)
+    tolerated = tolerance_of(setup, tolerance)
     terms = [s.term() for s in suspects(deployment.task, effects)]
     with bar_of(100, desc="diagnose", unit="%", disable=not progress) as bar:
 
@@ -73,16 +82,16 @@ def diagnose_run(
             bar.update(round(95 * share) - bar.n)
 
         setup, hypotheses = search(setup, terms, max_effects, rng, show, EFFORT)
-        verdict = reach_verdict(setup, hypotheses, None, rng)
+        verdict = reach_verdict(setup, hypotheses, None, rng, tolerated)
         bar.update(100 - bar.n)
     notes = list(deployment.notes)
     if len(deployment.episodes) == 1:
         notes.append("one episode only: its end is held out, so that both sides come from the same run")
-    notes += caution(verdict)
+    held = verdict.there if traces else verdict.best
+    report = assemble(setup, hypotheses, verdict, held, notes, rng)
     if out is not None:
-        out.mkdir(parents=True, exist_ok=True)
-        notes += write(deployment, verdict.best, out)
-    report = assemble(setup, hypotheses, verdict, notes, rng)
+        lowers = repairs(setup, held, verdict.there, hypotheses[0], rng)
+        repair.into(out, report.data, held, lowers, lambda: write(deployment, held, out))
     report.data["seconds"] = round(time.perf_counter() - began, 2)
     if out is not None:
         report.write(out)
@@ -107,22 +116,58 @@ def prepare(deployment: Deployment, window: float | None, held_out: float | Sequ
     return Setup(chain, fitted, held, blocks, fit(chain, [], [], fitted), noise, floor, np.log1p)
 
 
+def tolerance_of(setup: Setup[Chain], tolerance: float | Mapping[str, float | str] | None) -> Tolerance:
+    """Prediction errors of the observations and of the control that reaches the servos that may not matter."""
+    chain, names = setup.problem, signal_names(setup.problem)
+    measured = seen(chain.observed, chain.drive)
+    spread = measured.reshape(-1, len(names)).std(0)
+    limits = limits_of(tolerance, names, [UNITS[n.split("/")[0]] for n in names], spread)
+    return Tolerance(limits, _predict(chain), measured, setup.noise[: len(names)], tolerance is not None)
+
+
+def _predict(chain: Chain) -> Predict:
+    everything = np.arange(len(chain.windows.start))
+
+    def predict(fits: Sequence[Fit]) -> Array:
+        y = chain.predict([effects_of(f.terms, f.values) for f in fits], everything)
+        return seen(y.observation, y.drive)
+
+    return predict
+
+
+def signal_names(chain: Chain) -> list[str]:
+    """Observations and the control that reaches the servos."""
+    return chain.groups["observation"] + chain.groups["drive"]
+
+
+def seen(observation: Array, drive: Array) -> Array:
+    """Both at the end of each control step, [..., n, O + nu]."""
+    return np.concatenate([observation, drive[..., JOINT_SAMPLES - 1 :: JOINT_SAMPLES, :]], -1)
+
+
 def assemble(
-    setup: Setup[Chain], hypotheses: list[Hypothesis], verdict: Verdict, notes: list[str], rng: np.random.Generator
+    setup: Setup[Chain],
+    hypotheses: list[Hypothesis],
+    verdict: Verdict,
+    held: Hypothesis,
+    notes: list[str],
+    rng: np.random.Generator,
 ) -> Report:
-    """Everything that the report says; keys as for `--model --data`."""
+    """Everything that the report says, `held` in the repaired model; keys as for `--model --data`."""
     chain, best = setup.problem, verdict.best
     everything = np.arange(len(chain.windows.start))
-    sets = [(), effects_of(best.terms, best.values)]
+    sets = [(), effects_of(held.terms, held.values)]
     both = chain.predict(sets, everything)
     shown = verdict.kind in ("effect", "not_identifiable")
     tied = [best, *(e for e, _ in verdict.ties)]
     names = [n for group in chain.groups.values() for n in group]
     signals = held_out_rows(chain, both, setup, rng)
+    rows = Shown(_predict(chain), {n: UNITS[n.split("/")[0]] for n in signal_names(chain)})
     data: dict[str, Any] = {
         "verdict": verdict.kind,
         "reason": verdict.reason,
-        "effects": effect_rows(best, hypotheses, verdict) if shown else [],
+        "effects": effect_rows(setup, verdict, hypotheses, rows) if shown else [],
+        "traces": trace_rows(setup, verdict, hypotheses, rows),
         "candidates": candidate_rows(hypotheses, best, verdict, rng),
         "ties": [
             {"effects": e.names, "probability": verdict.probability[e.key], "held_out_error": e.error, "reason": reason}
@@ -139,14 +184,12 @@ def assemble(
         },
         "residual_model_error": None,
         "seconds": 0.0,
-        "repaired_model": "repaired.xml",
-        "effects_file": "effects.yaml",
+        "repaired_model": None,
+        "effects_file": None,
         "notes": notes,
     }
-    measured = np.concatenate([chain.observed, chain.drive[:, JOINT_SAMPLES - 1 :: JOINT_SAMPLES]], 2)
-    nominal, repaired = (
-        np.concatenate([both.observation[k], both.drive[k][:, JOINT_SAMPLES - 1 :: JOINT_SAMPLES]], 2) for k in (0, 1)
-    )
+    measured = seen(chain.observed, chain.drive)
+    nominal, repaired = seen(both.observation, both.drive)
     return Report(data, measured, nominal, repaired, replayer_view(chain))
 
 
@@ -184,9 +227,8 @@ def held_out_rows(
     names = [n for group in chain.groups.values() for n in group]
     seen, joints = ((s**2).mean((0, 1)) for s in (chain.observation_scale, chain.joint_scale))
     scale = np.concatenate([seen, np.full(len(chain.groups["drive"]), chain.drive_scale**2), joints])
-    units = {"observation": "of the observation", "drive": "of the control", "qpos": "rad"}
     return [
-        reduction(names[i], units[names[i].split("/")[0]], nominal[:, i], repaired[:, i], rng)
+        reduction(names[i], UNITS[names[i].split("/")[0]], nominal[:, i], repaired[:, i], rng)
         for i in np.argsort(-nominal.mean(0) / scale)
     ]
 
@@ -214,7 +256,7 @@ def write(deployment: Deployment, best: Hypothesis, out: Path) -> list[str]:
 def replayer_view(chain: Chain) -> Any:
     """What Report needs to draw: signals, windows, and the clock."""
     return SimpleNamespace(
-        signals=chain.groups["observation"] + chain.groups["drive"],
+        signals=signal_names(chain),
         windows=chain.windows,
         dt=chain.task.control_dt,
         episodes=[SimpleNamespace(name=e.name, seconds=len(e.action) * chain.task.control_dt) for e in chain.episodes],

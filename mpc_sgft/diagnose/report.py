@@ -14,8 +14,7 @@ import numpy as np
 
 from mpc_sgft.diagnose.data.measured import Array
 from mpc_sgft.diagnose.simulation.replay import Replayer
-
-MAX_CANDIDATES = 20
+from mpc_sgft.diagnose.words import headline, place
 
 
 @dataclass
@@ -50,15 +49,18 @@ class Report:
     def summary(self) -> str:
         """A few lines for the terminal."""
         d = self.data
-        lines = [f"verdict: {d['verdict']} ({d['reason']})"]
+        lines = [headline(d), f"verdict: {d['verdict']} ({d['reason']})"]
         for e in d["effects"]:
             numbers = ", ".join(
-                f"{k} = {v['value']:.4g} {v['unit']} [{v['low']:.4g}, {v['high']:.4g}]"
+                f"{k} = {v['value']:.4g}{_unit(v)} [{v['low']:.4g}, {v['high']:.4g}]"
                 for k, v in e["parameters"].items()
             )
-            lines.append(f"  {e['name']} at {', '.join(e['at']) or 'the scene'}: {numbers}")
+            lines.append(f"  {e['name']} at {place(e)}: {numbers}; {_share(e)}")
         for tie in d["ties"]:
             lines.append(f"  ties with: {' + '.join(tie['effects'])} {tie['reason']}")
+        for e in d["traces"]:
+            numbers = ", ".join(f"{k} = {v['value']:.4g}{_unit(v)}" for k, v in e["parameters"].items())
+            lines.append(f"  trace: {e['name']} at {place(e)}: {numbers}; {_share(e)}")
         h = d["held_out"]
         lines.append(
             f"held-out {h['signal']}: {h['nominal']:.4g} -> {h['repaired']:.4g} {h['unit']}, {h['reduction']:.0%} less "
@@ -67,6 +69,16 @@ class Report:
         if d["next_experiment"]:
             lines.append(f"next experiment: {d['next_experiment']}")
         return "\n".join([*lines, *(f"note: {n}" for n in d["notes"])])
+
+
+def _unit(parameter: dict[str, Any]) -> str:
+    return "" if parameter["unit"] == "1" else f" {parameter['unit']}"
+
+
+def _share(effect: dict[str, Any]) -> str:
+    """What an effect does, in words."""
+    changes = ", ".join(f"{c['signal']} by {c['rms']:.2g} {c['unit']}" for c in effect["changes"][:3])
+    return f"{effect['share']['value']:.2%} of the squared error" + (f", moves {changes}" if changes else "")
 
 
 def page(report: Report) -> str:

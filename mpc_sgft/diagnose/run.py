@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ import mujoco
 import numpy as np
 
 from mpc_sgft.command.errors import UserError
-from mpc_sgft.diagnose.candidates.library import candidates, effect_parameters, sums_of
+from mpc_sgft.diagnose.candidates.library import Term, candidates
 from mpc_sgft.diagnose.candidates.nominal import nominal_terms, refit_table
 from mpc_sgft.diagnose.data.check import check_settings, episodes
 from mpc_sgft.diagnose.data.measured import Array, Episode, files, read_table
@@ -22,14 +23,18 @@ from mpc_sgft.diagnose.fitting.prepare import Setup, near_fit, prepare, typical_
 from mpc_sgft.diagnose.fitting.residual_model import fit_residual_model
 from mpc_sgft.diagnose.fitting.screening import key_of
 from mpc_sgft.diagnose.fitting.search import nearest, refit, search
-from mpc_sgft.diagnose.report import MAX_CANDIDATES, Report
-from mpc_sgft.diagnose.simulation.plant import SHARP, Change, Plant
+from mpc_sgft.diagnose.report import Report
+from mpc_sgft.diagnose.rows import Shown, candidate_rows, effect_rows, reduction, trace_rows
+from mpc_sgft.diagnose.simulation.plant import SHARP, Change, Plant, joint_of
 from mpc_sgft.diagnose.simulation.replay import Replayer
 from mpc_sgft.diagnose.verdict import repair
 from mpc_sgft.diagnose.verdict.locate import locate
-from mpc_sgft.diagnose.verdict.naming import Verdict, caution, effect_probability, intervals, reach_verdict, settled
 from mpc_sgft.diagnose.verdict.naming import choose as choose_set
+from mpc_sgft.diagnose.verdict.naming import settled
 from mpc_sgft.diagnose.verdict.next_experiment import next_experiment
+from mpc_sgft.diagnose.verdict.relevance import repairs
+from mpc_sgft.diagnose.verdict.tolerance import Predict, Tolerance, limits_of
+from mpc_sgft.diagnose.verdict.verdict import Verdict, reach_verdict
 from mpc_sgft.storage.metrics import progress as bar_of
 
 STEPS = (4 * SHARP, 2 * SHARP, SHARP)  # [s] to simulate with: the longest whose error noise hides
@@ -64,6 +69,8 @@ def run(
     uncertain: Mapping[str, float],
     seed: int,
     max_effects: int,
+    tolerance: float | Mapping[str, float | str] | None,
+    traces: bool,
     progress: bool,
 ) -> Report:
     """As `mpc_sgft.diagnose.diagnose`, on episodes in memory."""
@@ -82,6 +89,7 @@ def run(
     def nearer(f: Fit, hidden: float = UNSEEN) -> Setup[Problem]:
         return _coarsest((near_fit(setup, f, plant.sharper(step)) for step in steps), hidden)
 
+    tolerated = tolerance_of(setup, tolerance)
     sharp = plant.sharper()
     sizes = typical_sizes(sharp, setup.problem.replayer)
     with bar_of(100, desc="diagnose", unit="%", disable=not progress) as bar:
@@ -103,20 +111,34 @@ def run(
                 setup, hypotheses = search(setup, terms, max_effects, rng, show)
                 best = choose_set(setup, hypotheses, rng)
         residual_model = None if settled(best) else fit_residual_model(setup, best, sizes, rng)
-        verdict = reach_verdict(setup, hypotheses, residual_model, rng)
+        verdict = reach_verdict(setup, hypotheses, residual_model, rng, tolerated)
         bar.update(100 - bar.n)
     notes = [n for e in recorded for n in e.notes]
     if len(recorded) == 1:
         notes.append("one episode only: its end is held out, so that both sides come from the same run")
-    notes += caution(verdict)
+    held = verdict.there if traces else verdict.best
+    left = residual_model and residual_model.error
+    report = assemble(plant, setup, hypotheses, verdict, held, notes, rng, left)
     if out is not None:
-        out.mkdir(parents=True, exist_ok=True)
-        notes += repair.write(plant, verdict.best, out)
-    report = assemble(plant, setup, hypotheses, verdict, notes, rng, residual_model and residual_model.error)
+        lowers = repairs(setup, held, verdict.there, hypotheses[0], rng)
+        repair.into(out, report.data, held, lowers, lambda: repair.write(plant, held, out))
     report.data["seconds"] = round(time.perf_counter() - began, 2)
     if out is not None:
         report.write(out)
     return report
+
+
+def tolerance_of(setup: Setup[Problem], tolerance: float | Mapping[str, float | str] | None) -> Tolerance:
+    """Prediction errors of the compared signals that may not matter."""
+    replayer = setup.problem.replayer
+    measured, signals = replayer.windows.measured, replayer.signals
+    spread = measured.reshape(-1, len(signals)).std(0)
+    limits = limits_of(tolerance, signals, [_unit(replayer.plant, n) for n in signals], spread)
+    return Tolerance(limits, _predict(replayer), measured, setup.noise, tolerance is not None)
+
+
+def _predict(replayer: Replayer) -> Predict:
+    return lambda fits: replayer.simulate([change_of(f.terms, f.values) for f in fits])
 
 
 def _coarsest(setups: Iterable[Setup[Problem]], hidden: float) -> Setup[Problem]:
@@ -137,14 +159,16 @@ def assemble(
     setup: Setup,
     hypotheses: list[Hypothesis],
     verdict: Verdict,
+    held: Hypothesis,
     notes: list[str],
     rng: np.random.Generator,
     residual_model_error: float | None,
 ) -> Report:
-    """Everything that the report says; errors are those of the scene in its own steps."""
+    """Everything that the report says, `held` in the repaired model; errors are those of the scene in its own steps."""
     best, base, sharp = verdict.best, setup.baseline, setup.problem.replayer
     replayer = Replayer(plant, sharp.episodes, sharp.windows.samples * sharp.dt, sharp.signals)
-    nominal, repaired = replayer.simulate([Change(), change_of(best.fit.terms, best.fit.values)])
+    rows = Shown(_predict(replayer), {n: _unit(plant, n) for n in replayer.signals}, partial(unit_at, plant))
+    nominal, repaired = replayer.simulate([Change(), change_of(held.fit.terms, held.fit.values)])
     measured = replayer.windows.measured
     signals = _signals(setup, nominal, repaired, measured, rng)
     shown = verdict.kind in ("effect", "not_identifiable")
@@ -156,7 +180,8 @@ def assemble(
     data: dict[str, Any] = {
         "verdict": verdict.kind,
         "reason": verdict.reason,
-        "effects": effect_rows(best, hypotheses, verdict) if shown else [],
+        "effects": effect_rows(setup, verdict, hypotheses, rows) if shown else [],
+        "traces": trace_rows(setup, verdict, hypotheses, rows),
         "candidates": candidate_rows(hypotheses, best, verdict, rng),
         "ties": ties,
         "next_experiment": next_experiment(setup, tied) if len(tied) > 1 else "",
@@ -170,65 +195,11 @@ def assemble(
         },
         "residual_model_error": residual_model_error,
         "seconds": 0.0,
-        "repaired_model": "repaired.xml",
-        "effects_file": "effects.yaml",
+        "repaired_model": None,
+        "effects_file": None,
         "notes": notes,
     }
     return Report(data, measured, nominal, repaired, replayer)
-
-
-def effect_rows(best: Hypothesis, hypotheses: list[Hypothesis], verdict: Verdict) -> list[dict[str, Any]]:
-    """What the report says of each named effect."""
-    out = []
-    bounds = intervals(best)
-    shares = effect_probability(best, hypotheses, verdict.probability)
-    for term, value, (low, high), share in zip(best.terms, best.values, bounds, shares, strict=True):
-        columns = [effect_parameters(term.effect, term.names, x) for x in (value, low, high)]
-        units = dict(zip(term.names, term.units, strict=True))
-        sums = sums_of(term.effect)
-        out.append(
-            {
-                "name": term.effect,
-                "at": list(term.at),
-                "parameters": {
-                    name: {
-                        "value": columns[0][name],
-                        "unit": units.get(name) or units[sums[name][0]],
-                        "low": columns[1][name],
-                        "high": columns[2][name],
-                    }
-                    for name in columns[0]
-                },
-                "probability": share,
-            }
-        )
-    return out
-
-
-def candidate_rows(
-    hypotheses: list[Hypothesis], best: Hypothesis, verdict: Verdict, rng: np.random.Generator
-) -> list[dict[str, Any]]:
-    """Ranked: what is named, what ties, then by error and size, first what has no more effects than what is named."""
-    front = [best.key, *(e.key for e, _ in verdict.ties)]
-    size = len(best.errors)
-
-    def order(e: Hypothesis) -> tuple[int, bool, float]:
-        place = front.index(e.key) if e.key in front else len(front)
-        return place, e.effects > best.effects, e.error * (1 + e.complexity / size)
-
-    out = []
-    for e in sorted(hypotheses, key=order)[:MAX_CANDIDATES]:
-        interval = judge.gain(e.errors, np.zeros(size), 0.90, rng)
-        out.append(
-            {
-                "effects": e.names,
-                "held_out_error": e.error,
-                "low": interval.low,
-                "high": interval.high,
-                "probability": verdict.probability[e.key],
-            }
-        )
-    return out
 
 
 def _signals(
@@ -243,6 +214,19 @@ def _signals(
     return [reduction(names[i], units[i], before[:, i], after[:, i], rng) for i in worst]
 
 
+def unit_at(plant: Plant, term: Term, unit: str) -> str:
+    """Of "N m or N", the one that belongs to the joint at which an effect is; both where it is at no joint."""
+    where = term.at[0] if term.at else ""
+    if unit == "of the observation" and where.startswith("qpos/"):
+        return _unit(plant, where)
+    joint = where.removeprefix("qpos/")
+    joint = joint_of(plant, joint) if joint in plant.actuators else joint
+    turning, _, sliding = unit.partition(" or ")
+    if not sliding or joint not in plant.joints:
+        return unit
+    return sliding if plant.axes()[joint].slide else turning
+
+
 def _unit(plant: Plant, signal: str) -> str:
     kind, part = signal.split("/", 1)
     if kind == "force":
@@ -251,26 +235,3 @@ def _unit(plant: Plant, signal: str) -> str:
         return "1"
     slide = plant.model.joint(part).type[0] == int(mujoco.mjtJoint.mjJNT_SLIDE)
     return ("m" if slide else "rad") + ("/s" if kind == "qvel" else "")
-
-
-def reduction(signal: str, unit: str, before: Array, after: Array, rng: np.random.Generator) -> dict[str, Any]:
-    """Root mean square error of one signal before and after, and by how much it fell, with its 90 % interval.
-
-    Args:
-        signal, unit: Of the signal.
-        before, after: Mean square error of each held-out window, [W].
-        rng: For the bootstrap.
-    """
-    picks = rng.integers(0, len(before), (judge.RESAMPLES, len(before)))
-    drops = 1 - np.sqrt(after[picks].mean(1) / np.maximum(before[picks].mean(1), 1e-300))
-    low, high = np.quantile(drops, [0.05, 0.95])
-    rms = [float(np.sqrt(x.mean())) for x in (before, after)]
-    return {
-        "signal": signal,
-        "unit": unit,
-        "nominal": rms[0],
-        "repaired": rms[1],
-        "reduction": 1 - rms[1] / max(rms[0], 1e-300),
-        "low": float(low),
-        "high": float(high),
-    }

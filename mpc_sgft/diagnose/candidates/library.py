@@ -198,8 +198,9 @@ def effect_parameters(effect: str, names: Sequence[str], x: Array) -> dict[str, 
         if sums
         else set()
     )
+    bounds = effect_class(effect).bounds if sums else {}
     return {k: v for k, v in fitted.items() if k not in inner} | {
-        k: fitted[a] + fitted[b] for k, (a, b) in sums.items()
+        k: float(np.clip(fitted[a] + fitted[b], *bounds.get(k, (-np.inf, np.inf)))) for k, (a, b) in sums.items()
     }
 
 

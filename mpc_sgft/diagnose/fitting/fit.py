@@ -272,8 +272,8 @@ class _Flat:
         self.terms = tuple(terms)
         none = np.zeros(0)
         self.size = np.concatenate([none, *(t.size for t in terms)])
-        self.low = np.concatenate([none, *(t.low for t in terms)]) / self.size
-        self.high = np.concatenate([none, *(t.high for t in terms)]) / self.size
+        self.least, self.most = (np.concatenate([none, *x]) for x in ([t.low for t in terms], [t.high for t in terms]))
+        self.low, self.high = self.least / self.size, self.most / self.size
         self.count = len(self.size)
         self.hops = np.concatenate([none, *(t.hops or np.zeros(len(t.size)) for t in terms)]) / self.size
 
@@ -282,7 +282,7 @@ class _Flat:
 
     def unpack(self, x: Array) -> list[Array]:
         cuts = np.cumsum([len(t.size) for t in self.terms])[:-1]
-        return np.split(np.clip(x * self.size, self.low * self.size, self.high * self.size), cuts)
+        return np.split(np.clip(x * self.size, self.least, self.most), cuts)
 
     def clip(self, x: Array) -> Array:
         return np.clip(x, self.low, self.high)

@@ -7,9 +7,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mpc_sgft.diagnose.candidates.effect_table import INCLUDES
-from mpc_sgft.diagnose.candidates.library import Term
+from mpc_sgft.diagnose.candidates.library import Term, includes
 from mpc_sgft.diagnose.data.measured import Array
-from mpc_sgft.diagnose.fitting.fit import Fit, by_parts, left_out_errors, window_errors
+from mpc_sgft.diagnose.fitting.fit import Fit, by_parts, fit, left_out_errors, window_errors
 from mpc_sgft.diagnose.fitting.prepare import Setup
 
 SEEN = 1e-3  # a parameter whose derivative is smaller than this share of its effect's largest changes nothing
@@ -80,3 +80,22 @@ def judge_fit(setup: Setup[Any], f: Fit) -> Hypothesis:
     norms = np.split(np.sqrt((f.J**2).sum((0, 1))), ends[:-1])[nominal:]  # of each effect's parameters
     seen = sum(int((own > SEEN * max(float(own.max()), 1e-12)).sum()) for own in norms if len(own))
     return Hypothesis(f, len(f.terms) - nominal, errors, fitted, seen)
+
+
+def holds(rich: Hypothesis, simple: Hypothesis) -> bool:
+    """Whether one set is the other with an effect in place of a simpler one that it includes."""
+    more, less = ([t for t in a.terms if t.label not in b.names] for a, b in ((rich, simple), (simple, rich)))
+    return len(more) == len(less) == 1 and includes(more[0], less[0])
+
+
+def without_effect(setup: Setup[Any], e: Hypothesis, i: int, hypotheses: list[Hypothesis]) -> Hypothesis:
+    """A set without its i-th effect, as it was fitted, or fitted now from where the others are."""
+    drop = len(e.fit.terms) - e.effects + i
+    terms = [t for k, t in enumerate(e.fit.terms) if k != drop]
+    key = frozenset(t.label + str(t.fixed) for t in terms[len(terms) - e.effects + 1 :])
+    there = next((h for h in hypotheses if h.key == key), None)
+    if there is None:
+        values = [v for k, v in enumerate(e.fit.values) if k != drop]
+        there = judge_fit(setup, fit(setup.problem, terms, values, setup.fitted))
+        hypotheses.append(there)
+    return there

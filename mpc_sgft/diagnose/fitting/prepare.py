@@ -48,6 +48,7 @@ class Setup(Generic[P]):
         parts: Into which each window is cut when sets are compared; a few long windows say more than many short ones.
         stepping: Share of the expected squared error that the simulator's time step makes.
         near: The fit near which it is right; None where nothing depends on that.
+        squared: What was judged -> that of which shares are taken: the squared error, in units of noise.
         judged: What of a window's error counts when sets are compared; the error itself by default.
     """
 
@@ -63,6 +64,7 @@ class Setup(Generic[P]):
     parts: int = 1
     stepping: float = 0.0
     near: Fit | None = None
+    squared: Callable[[Array], Array] = field(default=np.asarray)
 
     def one_window(self, errors: Array) -> bool:
         """Whether several parts of one window may show an effect: where windows are few, and noise alone is left.
@@ -166,7 +168,8 @@ def _setup(
         return np.log1p(np.maximum(errors, least))
 
     floor, stepping = np.median(own.floor[0], (0, 1)), float(problem.floor_shares[0].mean())
-    return Setup(problem, fitted, held, blocks, base, noise, floor, judged, NOISE + QUIET, parts, stepping, near)
+    quiet = NOISE + QUIET
+    return Setup(problem, fitted, held, blocks, base, noise, floor, judged, quiet, parts, stepping, near, np.expm1)
 
 
 def leave_out_blocks(fitted: int) -> Index:

@@ -1,46 +1,24 @@
-"""The verdict: an effect, none, unknown, or not identifiable from these data."""
+"""Which set of effects the data call for, what ties with it, and how sure its numbers are."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from scipy import stats
 
 from mpc_sgft.diagnose.candidates.effect_table import EQUIVALENT, Equivalence
-from mpc_sgft.diagnose.candidates.library import IDLE_WHILE_NEUTRAL, includes
+from mpc_sgft.diagnose.candidates.library import IDLE_WHILE_NEUTRAL
 from mpc_sgft.diagnose.data.measured import Array
 from mpc_sgft.diagnose.fitting import judge
-from mpc_sgft.diagnose.fitting.fit import fit
-from mpc_sgft.diagnose.fitting.hypothesis import Hypothesis, judge_fit
+from mpc_sgft.diagnose.fitting.hypothesis import Hypothesis, holds, without_effect
 from mpc_sgft.diagnose.fitting.prepare import ABOVE_NOISE, NOISE, Setup
-from mpc_sgft.diagnose.fitting.residual_model import ResidualModel
 
-UNEXPLAINED = 0.05  # share of what any model can explain that named effects may miss before the answer is "unknown"
 FIRST_GAIN = 0.025  # in log(1 + e), of the only effect where the nominal model leaves noise alone
 NEXT_GAIN = 0.06  # in log(1 + e), of one more effect where noise alone is left
 RICHER_SHARE = 0.2  # of what is worth a name, of a richer effect in place of one that it includes
 WIDER = 1.3  # of intervals: what windows that begin at each other's ends share; set on development seeds
-LEFT = 0.1  # share of the squared error above noise that names may leave
-
-
-class Verdict(NamedTuple):
-    """The answer.
-
-    Attributes:
-        kind: "effect", "none", "unknown" or "not_identifiable".
-        best: The set that is named; the baseline if there is none.
-        ties: Sets of the same size that these data cannot rule out, and why if that is declared.
-        probability: Share of resampled windows in which a set wins, by key.
-        reason: In words.
-    """
-
-    kind: str
-    best: Hypothesis
-    ties: list[tuple[Hypothesis, str]]
-    probability: dict[frozenset[str], float]
-    reason: str
 
 
 def choose(setup: Setup[Any], hypotheses: list[Hypothesis], rng: np.random.Generator) -> Hypothesis:
@@ -92,75 +70,11 @@ def distinct(e: Hypothesis) -> bool:
 
 def prune(setup: Setup[Any], best: Hypothesis, hypotheses: list[Hypothesis], rng: np.random.Generator) -> Hypothesis:
     """Leave out effects that are not needed once the others are there; fitted subsets join `hypotheses`."""
-    nominal = len(setup.baseline.terms)
-    for i in range(nominal, len(best.fit.terms)):
-        if best.effects < 2:
-            break
-        keep = [k for k in range(len(best.fit.terms)) if k != i]
-        key = frozenset(best.fit.terms[k].label + str(best.fit.terms[k].fixed) for k in keep if k >= nominal)
-        without = next((e for e in hypotheses if e.key == key), None)
-        if without is None:
-            terms = [best.fit.terms[k] for k in keep]
-            without = judge_fit(setup, fit(setup.problem, terms, [best.fit.values[k] for k in keep], setup.fitted))
-            hypotheses.append(without)
+    for i in range(best.effects if best.effects > 1 else 0):
+        without = without_effect(setup, best, i, hypotheses)
         if not gains(setup, without, best, rng):
             return prune(setup, without, hypotheses, rng)
     return best
-
-
-def reach_verdict(
-    setup: Setup[Any], hypotheses: list[Hypothesis], residual_model: ResidualModel | None, rng: np.random.Generator
-) -> Verdict:
-    """Compare everything that was fitted.
-
-    Args:
-        setup: Problem and baseline.
-        hypotheses: From `search`, baseline first.
-        residual_model: Residual model on top of the chosen set; None if it was not fitted.
-        rng: For the bootstrap.
-    """
-    best = choose(setup, hypotheses, rng)
-    probability = dict.fromkeys((e.key for e in hypotheses), 0.0)
-    rivals = [e for e in hypotheses if e.complexity <= 1 or no_larger(e, best)]  # larger sets are no more credible
-    shares = judge.win_shares(
-        np.array([e.errors for e in rivals]), np.array([e.complexity for e in rivals]), rng, setup.problem.blocks
-    )
-    probability |= {e.key: float(s) for e, s in zip(rivals, shares, strict=True)}
-    best, ties = as_given(setup, best, find_ties(setup, best, hypotheses, rng))
-    declared = [(e, equivalence(best, e)) for e in ties]
-    base = hypotheses[0]
-    if residual_model is not None and beats(residual_model, best, base, setup.parts, rng):
-        missed = (best.error - residual_model.error) / max(base.error - residual_model.error, 1e-12)
-        reason = f"a flexible residual model explains {missed:.0%} more of the error than {_list(best)}"
-        ties = [(e, "" if q is None else q.reason) for e, q in declared]
-        return Verdict("unknown", best, ties, probability, reason)
-    times = np.sqrt(np.expm1(best.error))
-    if not best.effects:
-        reason = "the nominal model's error is within noise and the simulator's floor"
-        if not settled(base):
-            tried = "no name" if residual_model is None else "no name and no flexible model"
-            reason = f"{tried} explains the error, {times:.1f} times noise and floor, on windows that were not fitted"
-        return Verdict("none", best, [], probability, reason)
-    if judge.leaves_much(best.error, base.error, LEFT):
-        reason = f"{_list(best)} leaves {times:.1f} times noise and floor, which no name in the library explains"
-        return Verdict("unknown", best, [(e, "" if q is None else q.reason) for e, q in declared], probability, reason)
-    first, (best, open_ties) = best, canonical(best, declared)
-    declared = [*declared, (first, equivalence(best, first))]  # where a convention prefers another
-    named: list[tuple[Hypothesis, str]] = []
-    for e, q in declared:  # each set of names once: the best of those that differ in what is held
-        if sorted(e.names) not in [sorted(other.names) for other in (best, *(t for t, _ in named))]:
-            named.append((e, "" if q is None else q.reason))
-    if open_ties:
-        return Verdict("not_identifiable", best, named, probability, f"{_list(best)} and {len(open_ties)} others tie")
-    return Verdict("effect", best, named, probability, f"no larger set is credibly better than {_list(best)}")
-
-
-def caution(verdict: Verdict) -> list[str]:
-    """A note where the repaired files hold effects that the report does not name."""
-    if verdict.kind != "unknown" or not verdict.best.effects:
-        return []
-    held = _list(verdict.best)
-    return [f"repaired.xml and effects.yaml hold {held}: a fit that takes part of the error away, not its name"]
 
 
 def find_ties(
@@ -205,12 +119,6 @@ def _odds_as_given(e: Hypothesis, count: int) -> float:
         there = stats.norm.pdf(term.neutral, value, np.maximum(sd, 1e-12 * span))
         total += float(np.log((1 + span * there) / 2).sum())
     return total
-
-
-def holds(rich: Hypothesis, simple: Hypothesis) -> bool:
-    """Whether one set is the other with an effect in place of a simpler one that it includes."""
-    more, less = ([t for t in a.terms if t.label not in b.names] for a, b in ((rich, simple), (simple, rich)))
-    return len(more) == len(less) == 1 and includes(more[0], less[0])
 
 
 def no_larger(e: Hypothesis, best: Hypothesis) -> bool:
@@ -260,15 +168,6 @@ def settled(best: Hypothesis) -> bool:
     return best.error < NOISE + ABOVE_NOISE
 
 
-def beats(
-    residual_model: ResidualModel, best: Hypothesis, base: Hypothesis, parts: int, rng: np.random.Generator
-) -> bool:
-    """Whether something that no name in the library covers is clearly there."""
-    if settled(best) or not judge.credible(best.errors, residual_model.errors, rng, parts):
-        return False
-    return best.error - residual_model.error > UNEXPLAINED * (base.error - residual_model.error)
-
-
 def standard_deviations(f_entry: Hypothesis) -> list[Array]:
     """Standard deviations of each term's parameters: the wider of the model's and the windows' own scatter.
 
@@ -296,10 +195,6 @@ def intervals(f_entry: Hypothesis, level: float = 0.90) -> list[tuple[Array, Arr
     rows = zip(f.terms, f.values, standard_deviations(f_entry), strict=True) if f.terms else ()
     bounds = [(np.maximum(v - half * sd, t.low), np.minimum(v + half * sd, t.high)) for t, v, sd in rows]
     return bounds[len(f.terms) - f_entry.effects :]
-
-
-def _list(e: Hypothesis) -> str:
-    return " + ".join(e.names) or "the nominal model"
 
 
 def effect_probability(

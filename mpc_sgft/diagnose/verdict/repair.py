@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import mujoco
 
@@ -29,6 +31,41 @@ def repaired_spec(plant: Plant, best: Hypothesis) -> tuple[mujoco.MjSpec, list[s
         if sensor.name.startswith(FORCE):
             spec.delete(sensor)
     return spec, notes
+
+
+FILES = ("repaired.xml", "effects.yaml")
+
+
+def into(
+    out: Path, data: dict[str, Any], held: Hypothesis, repairs: bool, write_files: Callable[[], list[str]]
+) -> None:
+    """Write the repair into a folder if it repairs, and say so in the report: those of an earlier report go.
+
+    Args:
+        out: The folder.
+        data: Of the report.
+        held: What the repair holds.
+        repairs: Whether it credibly lowers the error of windows that were never fitted.
+        write_files: Writes repaired.xml and effects.yaml, and returns notes.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    for name in FILES:
+        (out / name).unlink(missing_ok=True)
+    if not held.fit.terms:
+        return
+    what, h = " + ".join(held.names) or "refitted quantities", data["held_out"]
+    if not repairs:
+        data["notes"].append(
+            f"no repaired.xml: with {what}, the error of {h['signal']} on windows that were never fitted does not "
+            f"credibly fall ({h['nominal']:.3g} -> {h['repaired']:.3g} {h['unit']})"
+        )
+        return
+    data["repaired_model"], data["effects_file"] = FILES
+    data["notes"] += write_files()
+    if data["verdict"] == "unknown":
+        data["notes"].append(
+            f"repaired.xml and effects.yaml hold {what}: a fit that takes part of the error away, not its name"
+        )
 
 
 def write(plant: Plant, best: Hypothesis, out: Path) -> list[str]:

@@ -94,7 +94,8 @@ HELD_OUT = {
 REPORT = {  # key of report.json -> type, or {key: type} of each item
     "verdict": str,
     "reason": str,
-    "effects": {"name": str, "at": list, "parameters": dict, "probability": float},
+    "effects": {"name": str, "at": list, "parameters": dict, "probability": float, "share": dict, "changes": list},
+    "traces": {"name": str, "at": list, "parameters": dict, "share": dict, "changes": list},
     "candidates": {"effects": list, "held_out_error": float, "low": float, "high": float, "probability": float},
     "ties": {"effects": list, "probability": float, "held_out_error": float, "reason": str},
     "next_experiment": str,
@@ -105,8 +106,8 @@ REPORT = {  # key of report.json -> type, or {key: type} of each item
     "noise_floor": dict,
     "residual_model_error": (float, type(None)),
     "seconds": float,
-    "repaired_model": str,
-    "effects_file": str,
+    "repaired_model": (str, type(None)),
+    "effects_file": (str, type(None)),
     "notes": list,
 }
 
@@ -131,6 +132,9 @@ def check_report() -> Callable[[dict], None]:
             for parameter in effect["parameters"].values():
                 assert set(parameter) == {"value", "unit", "low", "high"}
                 assert parameter["low"] <= parameter["value"] <= parameter["high"]
+        for effect in report["effects"] + report["traces"]:
+            assert set(effect["share"]) == {"value", "low", "high"}
+            assert all(set(c) == {"signal", "unit", "rms"} and c["rms"] >= 0 for c in effect["changes"])
         for floor in report["noise_floor"].values():
             assert set(floor) == {"noise", "simulator"}
 

@@ -14,13 +14,15 @@ from mpc_sgft.diagnose.candidates.library import Term, as_gap, candidates, setti
 from mpc_sgft.diagnose.fitting import screening as screening
 from mpc_sgft.diagnose.fitting import search as searching
 from mpc_sgft.diagnose.fitting.fit import Fit, fit
-from mpc_sgft.diagnose.fitting.hypothesis import Hypothesis, judge_fit
+from mpc_sgft.diagnose.fitting.hypothesis import Hypothesis, holds, judge_fit
 from mpc_sgft.diagnose.fitting.prepare import NOISE, Setup
 from mpc_sgft.diagnose.fitting.residual_model import ResidualModel
 from mpc_sgft.diagnose.fitting.screening import Effort
 from mpc_sgft.diagnose.fitting.search import no_worse, search, swaps
 from mpc_sgft.diagnose.simulation.plant import Change, Plant
-from mpc_sgft.diagnose.verdict.naming import caution, gains, holds, reach_verdict
+from mpc_sgft.diagnose.verdict.naming import gains
+from mpc_sgft.diagnose.verdict.tolerance import Tolerance
+from mpc_sgft.diagnose.verdict.verdict import reach_verdict
 
 Points = Sequence[Sequence[np.ndarray]]
 PENDULUM = """<mujoco><worldbody><body><joint name="hinge" axis="0 1 0"/><geom size="0.05" pos="0 0 -0.4" mass="1"/>
@@ -52,6 +54,17 @@ class Lines:
         return np.stack([one(p) for p in points])
 
 
+def motion(problem: Lines, limit: float = 0.01, asked: bool = False) -> Tolerance:
+    """Of a share of the motion, which is y."""
+    everything = np.arange(len(problem.y))
+
+    def predict(fits: Sequence[Fit]) -> np.ndarray:
+        return np.stack([(problem.residuals(f.terms, [f.values], everything)[0] + problem.y)[..., None] for f in fits])
+
+    limits = np.array([limit * problem.y.std()])
+    return Tolerance(limits, predict, problem.y[..., None], np.ones(1), asked)
+
+
 def found(pairs: int) -> list[set[str]]:
     problem, fitted = Lines(), np.arange(18)
     base = fit(problem, [], [], fitted)
@@ -75,7 +88,7 @@ def test_a_small_second_effect_is_found_where_the_first_leaves_less_than_the_noi
     setup = Setup(problem, fitted, np.arange(18, 24), fitted // 3, base, none, none, np.log1p, NOISE)
     _, hypotheses = search(setup, [term(name) for name in "abcdefgh"], 2, rng)
     assert next(e.error for e in hypotheses if e.names == ["a"]) < setup.quiet
-    verdict = reach_verdict(setup, hypotheses, None, rng)
+    verdict = reach_verdict(setup, hypotheses, None, rng, motion(problem))
     assert (verdict.kind, sorted(verdict.best.names)) == ("effect", ["a", "b"])
     assert max(e.effects for e in search(setup, [term(x) for x in "abcdefgh"], 3, rng)[1]) == 2  # nor a third
 
@@ -101,12 +114,12 @@ def test_further_effects_are_sought_in_the_problem_as_the_first_sees_it() -> Non
     assert searched(setups[0], terms, rng) == [["b", "c"]]
     setup, hypotheses = search(setups[0], terms, 2, rng, nearer=nearer)
     assert setup is setups[1] and asked == [["b"]] and not hypotheses[0].effects
-    assert reach_verdict(setup, hypotheses, None, rng).best.names == ["b"]
+    assert reach_verdict(setup, hypotheses, None, rng, motion(setup.problem)).best.names == ["b"]
 
 
 def searched(setup: Setup[Lines], terms: Sequence[Term], rng: np.random.Generator) -> list[list[str]]:
     setup, hypotheses = search(setup, terms, 2, rng)
-    return [sorted(reach_verdict(setup, hypotheses, None, rng).best.names)]
+    return [sorted(reach_verdict(setup, hypotheses, None, rng, motion(setup.problem)).best.names)]
 
 
 def test_what_gains_no_more_than_chance_gets_no_full_fit_where_noise_alone_is_left() -> None:
@@ -214,7 +227,7 @@ def test_a_tie_that_needs_another_mass_loses_against_one_that_finds_it_as_given(
     base = fit(problem, [nominal], [one], fitted)
     setup = Setup(problem, fitted, np.arange(18, 24), fitted // 3, base, none, none, np.log1p)
     named = [judge_fit(setup, fit(problem, [nominal, term(x)], [one, one], fitted)) for x in "ba"]
-    verdict = reach_verdict(setup, [judge_fit(setup, base), *named], None, np.random.default_rng(0))
+    verdict = reach_verdict(setup, [judge_fit(setup, base), *named], None, np.random.default_rng(0), motion(problem))
     assert verdict.kind == kind and sorted({*verdict.best.names, *(n for e, _ in verdict.ties for n in e.names)}) == (
         ["a"] if kind == "effect" else ["a", "b"]
     )
@@ -229,9 +242,8 @@ def test_names_that_leave_much_of_an_error_are_no_answer(before: float, after: f
     scatter = 0.01 * np.random.default_rng(0).normal(size=24)
     base = judge_fit(setup, setup.baseline)._replace(errors=np.log1p(before) + scatter)
     named = judge_fit(setup, fit(problem, [term("a")], [np.ones(1)], fitted))._replace(errors=np.log1p(after) + scatter)
-    verdict = reach_verdict(setup, [base, named], None, np.random.default_rng(0))
+    verdict = reach_verdict(setup, [base, named], None, np.random.default_rng(0), motion(problem))
     assert verdict.kind == kind
-    assert [("hold a:" in note) for note in caution(verdict)] == [True] * (kind == "unknown")
 
 
 @pytest.mark.parametrize(
@@ -251,9 +263,9 @@ def test_an_error_is_unknown_if_a_flexible_model_explains_it(
     errors = np.log1p(left) + 0.01 * np.random.default_rng(0).normal(size=24)
     base = judge_fit(setup, setup.baseline)._replace(errors=errors)
     model = None if flexible is None else ResidualModel(errors + np.log1p(flexible) - np.log1p(left), np.zeros(1), 1.0)
-    verdict = reach_verdict(setup, [base], model, np.random.default_rng(0))
+    verdict = reach_verdict(setup, [base], model, np.random.default_rng(0), motion(problem))
     assert verdict.kind == kind and words in verdict.reason
-    assert not verdict.best.effects and not caution(verdict)
+    assert not verdict.best.effects
 
 
 def test_a_typical_size_is_no_larger_than_what_is_allowed() -> None:

@@ -1,0 +1,138 @@
+"""Rows of report.json: effects, traces, candidates, and errors before and after."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from mpc_sgft.diagnose.candidates.library import Term, effect_parameters, sums_of
+from mpc_sgft.diagnose.data.measured import Array
+from mpc_sgft.diagnose.fitting import judge
+from mpc_sgft.diagnose.fitting.hypothesis import Hypothesis, without_effect
+from mpc_sgft.diagnose.fitting.prepare import Setup
+from mpc_sgft.diagnose.verdict.naming import effect_probability, intervals
+from mpc_sgft.diagnose.verdict.relevance import Relevance, by_window, foretold
+from mpc_sgft.diagnose.verdict.tolerance import Predict
+from mpc_sgft.diagnose.verdict.verdict import Verdict
+
+MAX_CANDIDATES = 20
+
+
+class Shown(NamedTuple):
+    """How effects are shown.
+
+    Attributes:
+        predict: Fits -> predictions.
+        signals: That are predicted -> their unit.
+        unit: An effect and the unit of its parameter, such as "N m or N" -> the one of the two that it is there.
+    """
+
+    predict: Predict
+    signals: Mapping[str, str]
+    unit: Callable[[Term, str], str] = lambda term, unit: unit
+
+
+def effect_rows(
+    setup: Setup[Any], verdict: Verdict, hypotheses: list[Hypothesis], shown: Shown
+) -> list[dict[str, Any]]:
+    """What the report says of each named effect."""
+    best, out = verdict.best, []
+    bounds = intervals(best)
+    wins = effect_probability(best, hypotheses, verdict.probability)
+    changes = changes_of(setup, best, hypotheses, shown.predict)
+    for term, value, (low, high), win, s, change in zip(
+        best.terms, best.values, bounds, wins, verdict.shares, changes, strict=True
+    ):
+        row = _row(s, value, change, shown)
+        lows, highs = (effect_parameters(term.effect, term.names, x) for x in (low, high))
+        for name, parameter in row["parameters"].items():
+            parameter |= {"low": lows[name], "high": highs[name]}
+        out.append(row | {"probability": win})
+    return out
+
+
+def trace_rows(setup: Setup[Any], verdict: Verdict, hypotheses: list[Hypothesis], shown: Shown) -> list[dict[str, Any]]:
+    """What the report says of each effect that is there and does not matter."""
+    there = verdict.there
+    changes = dict(zip(there.names, changes_of(setup, there, hypotheses, shown.predict), strict=True))
+    none = np.full(len(shown.signals), np.nan)  # where a simpler effect took its place before it was left out
+    return [_row(s, s.value, changes.get(s.term.label, none), shown) for s in verdict.traces]
+
+
+def _row(s: Relevance, value: Array, change: Array, shown: Shown) -> dict[str, Any]:
+    units, sums = dict(zip(s.term.names, s.term.units, strict=True)), sums_of(s.term.effect)
+    return {
+        "name": s.term.effect,
+        "at": list(s.term.at),
+        "parameters": {
+            name: {"value": x, "unit": shown.unit(s.term, units.get(name) or units[sums[name][0]])}
+            for name, x in effect_parameters(s.term.effect, s.term.names, value).items()
+        },
+        "share": {"value": s.share, "low": s.low, "high": s.high},
+        "changes": [
+            {"signal": n, "unit": u, "rms": float(x)}
+            for (n, u), x in zip(shown.signals.items(), change, strict=True)
+            if np.isfinite(x)
+        ],
+    }
+
+
+def changes_of(setup: Setup[Any], e: Hypothesis, hypotheses: list[Hypothesis], predict: Predict) -> Array:
+    """How far predictions of a set move when one of its effects is left out and the others fitted anew, [effects, S].
+
+    Root mean square over windows that the set foretells, in the signals' units.
+    """
+    y = predict([e.fit, *(without_effect(setup, e, i, hypotheses).fit for i in range(e.effects))])
+    told = by_window(foretold(setup, e), setup)
+    return np.sqrt(np.einsum("w,kwns->ks", told, (y[1:] - y[:1]) ** 2) / y[0, ..., 0].size)
+
+
+def candidate_rows(
+    hypotheses: list[Hypothesis], best: Hypothesis, verdict: Verdict, rng: np.random.Generator
+) -> list[dict[str, Any]]:
+    """Ranked: what is named, what ties, then by error and size, first what has no more effects than what is named."""
+    front = [best.key, *(e.key for e, _ in verdict.ties)]
+    size = len(best.errors)
+
+    def order(e: Hypothesis) -> tuple[int, bool, float]:
+        place = front.index(e.key) if e.key in front else len(front)
+        return place, e.effects > best.effects, e.error * (1 + e.complexity / size)
+
+    out = []
+    for e in sorted(hypotheses, key=order)[:MAX_CANDIDATES]:
+        interval = judge.gain(e.errors, np.zeros(size), 0.90, rng)
+        out.append(
+            {
+                "effects": e.names,
+                "held_out_error": e.error,
+                "low": interval.low,
+                "high": interval.high,
+                "probability": verdict.probability[e.key],
+            }
+        )
+    return out
+
+
+def reduction(signal: str, unit: str, before: Array, after: Array, rng: np.random.Generator) -> dict[str, Any]:
+    """Root mean square error of one signal before and after, and by how much it fell, with its 90 % interval.
+
+    Args:
+        signal, unit: Of the signal.
+        before, after: Mean square error of each held-out window, [W].
+        rng: For the bootstrap.
+    """
+    picks = rng.integers(0, len(before), (judge.RESAMPLES, len(before)))
+    drops = 1 - np.sqrt(after[picks].mean(1) / np.maximum(before[picks].mean(1), 1e-300))
+    low, high = np.quantile(drops, [0.05, 0.95])
+    rms = [float(np.sqrt(x.mean())) for x in (before, after)]
+    return {
+        "signal": signal,
+        "unit": unit,
+        "nominal": rms[0],
+        "repaired": rms[1],
+        "reduction": 1 - rms[1] / max(rms[0], 1e-300),
+        "low": float(low),
+        "high": float(high),
+    }

@@ -1,0 +1,120 @@
+"""How well the model must predict, in the units of the signals: what the user calls good enough."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from mpc_sgft.command.errors import UserError
+from mpc_sgft.diagnose.data.measured import Array
+from mpc_sgft.diagnose.fitting.fit import Fit
+
+Predict = Callable[[Sequence[Fit]], Array]  # K fits -> predictions of all windows, [K, W, n, S]
+UNITS = {
+    "m": {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6},
+    "rad": {"rad": 1.0, "mrad": 1e-3, "deg": np.pi / 180},
+    "m/s": {"m/s": 1.0, "mm/s": 1e-3},
+    "rad/s": {"rad/s": 1.0, "deg/s": np.pi / 180},
+    "N or N m": {"N": 1.0, "Nm": 1.0, "mN": 1e-3, "mNm": 1e-3},
+}
+
+
+SMALL = 0.01  # of a signal's standard deviation: what changes predictions by less may be a trace if nobody says
+
+
+@dataclass(frozen=True)
+class Tolerance:
+    """Root mean square errors, over windows that each start at the measured state, that may not matter.
+
+    Args:
+        limits: Of each signal in its unit, [S]; infinite where any error will do.
+        predict: Fits -> predictions.
+        measured: [W, n, S].
+        noise: Of each signal, [S].
+        asked: Whether the user gave it: what is within it then does not matter, however large a share of the error.
+    """
+
+    limits: Array
+    predict: Predict
+    measured: Array
+    noise: Array
+    asked: bool
+
+    def allows(self, f: Fit) -> bool:
+        """Whether the user said that a fit's own error, without the noise, may be left as it is."""
+        if not self.asked:
+            return False
+        missed = ((self.predict([f])[0] - self.measured) ** 2).mean((0, 1)) - self.noise**2
+        return bool((missed <= self.limits**2).all())
+
+    def alike(self, a: Fit, b: Fit, told: Array) -> bool:
+        """Whether two fits predict much the same, on windows of these weights [W]."""
+        one, other = self.predict([a, b])
+        return bool((np.einsum("w,wns->s", told, (one - other) ** 2) / one[..., 0].size <= self.limits**2).all())
+
+
+def parse_tolerance(text: str) -> float | dict[str, str]:
+    """`1%` -> 0.01, a share; `qpos/j=0.5mm,qpos/k=0.1deg` -> {signal: number with unit}.
+
+    Raises:
+        UserError: If it is neither.
+    """
+    if "=" not in text:
+        number = text.strip().removesuffix("%")
+        try:
+            return float(number) / (100 if "%" in text else 1)
+        except ValueError as error:
+            raise _unreadable(text) from error
+    parts = (item.partition("=") for item in text.split(",") if item.strip())
+    return {name.strip(): value.strip() for name, _, value in parts}
+
+
+def limits_of(
+    tolerance: float | Mapping[str, float | str] | None, signals: Sequence[str], units: Sequence[str], spread: Array
+) -> Array:
+    """Tolerated root mean square error of each signal in its unit, [S].
+
+    Args:
+        tolerance: A share of each signal's spread, SMALL if None; or signal -> number in its unit, or with a unit of
+            its own. Signals that are not named do not count.
+        signals, units: That are compared.
+        spread: Standard deviation of each, [S].
+
+    Raises:
+        UserError: For a signal that is not compared, or a number that cannot be.
+    """
+    if tolerance is None:
+        return SMALL * spread
+    if isinstance(tolerance, int | float):
+        if not 0 < tolerance < 1:
+            raise UserError(f"--tolerance {tolerance:g}: a share of the motion is between 0 and 1, such as 1%.")
+        return tolerance * spread
+    limits = np.full(len(signals), np.inf)
+    for name, value in tolerance.items():
+        if name not in signals:
+            raise UserError(f"--tolerance: {name!r} is no compared signal. There are: {', '.join(signals)}.")
+        i = list(signals).index(name)
+        limits[i] = _in_unit(name, value, units[i])
+    return limits
+
+
+def _in_unit(name: str, value: float | str, unit: str) -> float:
+    known = UNITS.get(unit, {})
+    match = re.fullmatch(r"([0-9.eE+-]+?)\s*([a-zA-Z/]*)", str(value))
+    if match is None or match[2] and match[2] not in known:
+        allowed = ", ".join(known) or "a plain number"
+        raise UserError(f"--tolerance {name}={value}: no size of this signal. Units that fit: {allowed}.")
+    try:
+        number = float(match[1]) * known.get(match[2], 1.0)
+    except ValueError as error:
+        raise _unreadable(f"{name}={value}") from error
+    if not (np.isfinite(number) and number > 0):
+        raise UserError(f"--tolerance {name}={value}: a number above 0 is needed.")
+    return number
+
+
+def _unreadable(text: str) -> UserError:
+    return UserError(f"--tolerance {text!r}: write a share of the motion, 1%, or signal=number, qpos/j=0.5mm.")

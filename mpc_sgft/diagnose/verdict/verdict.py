@@ -1,0 +1,136 @@
+"""The verdict: an effect, none, unknown, or not identifiable from these data."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from mpc_sgft.diagnose.fitting import judge
+from mpc_sgft.diagnose.fitting.hypothesis import Hypothesis
+from mpc_sgft.diagnose.fitting.prepare import Setup
+from mpc_sgft.diagnose.fitting.residual_model import ResidualModel
+from mpc_sgft.diagnose.verdict.naming import as_given, canonical, choose, equivalence, find_ties, no_larger, settled
+from mpc_sgft.diagnose.verdict.relevance import MATTERS, Relevance, foretold, mean_error, shares_of, what_matters
+from mpc_sgft.diagnose.verdict.tolerance import Tolerance
+
+LEFT = 0.1  # share of the squared error above noise that names may leave
+
+
+class Verdict(NamedTuple):
+    """The answer.
+
+    Attributes:
+        kind: "effect", "none", "unknown" or "not_identifiable".
+        best: The set that is named; the baseline if there is none.
+        ties: Sets of the same size that these data cannot rule out, and why if that is declared.
+        probability: Share of resampled windows in which a set wins, by key.
+        reason: In words.
+        there: The set of all that is credibly there, traces too.
+        shares: What each effect of the best set does beyond the others.
+        traces: Effects that are there and do not matter, largest first.
+    """
+
+    kind: str
+    best: Hypothesis
+    ties: list[tuple[Hypothesis, str]]
+    probability: dict[frozenset[str], float]
+    reason: str
+    there: Hypothesis
+    shares: list[Relevance]
+    traces: list[Relevance]
+
+
+def reach_verdict(
+    setup: Setup[Any],
+    hypotheses: list[Hypothesis],
+    residual_model: ResidualModel | None,
+    rng: np.random.Generator,
+    tolerance: Tolerance,
+) -> Verdict:
+    """Compare everything that was fitted: first what is there, then what of it matters, then what else would do.
+
+    Args:
+        setup: Problem and baseline.
+        hypotheses: From `search`, baseline first.
+        residual_model: Residual model on top of the chosen set; None if it was not fitted.
+        rng: For the bootstrap.
+        tolerance: Prediction errors that may not matter.
+    """
+    base, there = hypotheses[0], choose(setup, hypotheses, rng)
+    best, traces = what_matters(setup, there, hypotheses, rng, tolerance)
+    good_enough = tolerance.allows(base.fit)
+    if good_enough:
+        traces, best = [*shares_of(setup, best, there, hypotheses, rng), *traces], base
+    probability = dict.fromkeys((e.key for e in hypotheses), 0.0)
+    rivals = [e for e in hypotheses if e.complexity <= 1 or no_larger(e, best)]  # larger sets are no more credible
+    wins = judge.win_shares(
+        np.array([e.errors for e in rivals]), np.array([e.complexity for e in rivals]), rng, setup.problem.blocks
+    )
+    probability |= {e.key: float(s) for e, s in zip(rivals, wins, strict=True)}
+    best, ties = as_given(setup, best, find_ties(setup, best, hypotheses, rng))
+    declared = [(e, equivalence(best, e)) for e in ties]
+    kind, reason = _no_name(setup, there, best, base, None if tolerance.allows(there.fit) else residual_model, rng)
+    if good_enough:
+        kind, reason = "none", "the nominal model's error is within the tolerance"
+    if kind:
+        named = [(e, "" if q is None else q.reason) for e, q in declared] if kind == "unknown" else []
+    else:
+        first, (best, open_ties) = best, canonical(best, declared)
+        declared = [*declared, (first, equivalence(best, first))]  # where a convention prefers another
+        named = []
+        for e, q in declared:  # each set of names once: the best of those that differ in what is held
+            if sorted(e.names) not in [sorted(other.names) for other in (best, *(t for t, _ in named))]:
+                named.append((e, "" if q is None else q.reason))
+        kind = "not_identifiable" if open_ties else "effect"
+        reason = f"no larger set is better than {_list(best)} by what matters"
+        if open_ties:
+            reason = f"{_list(best)} and {len(open_ties)} others tie"
+    shares = shares_of(setup, best, there, hypotheses, rng)
+    return Verdict(kind, best, named, probability, reason, there, shares, traces)
+
+
+def _no_name(
+    setup: Setup[Any],
+    there: Hypothesis,
+    best: Hypothesis,
+    base: Hypothesis,
+    residual_model: ResidualModel | None,
+    rng: np.random.Generator,
+) -> tuple[str, str]:
+    """ "unknown" or "none" with the reason; empty words where there is a name.
+
+    Args:
+        setup: Problem and baseline.
+        there: All that is credibly there.
+        best: What of it matters.
+        base: The nominal model.
+        residual_model: On top of `there`.
+        rng: For the bootstrap.
+    """
+    told = foretold(setup, there)
+    if residual_model is not None and beats(setup, residual_model, there, rng):
+        missed = float((told * (setup.squared(there.errors) - setup.squared(residual_model.errors))).mean())
+        share = missed / mean_error(setup, base, told)
+        if share > MATTERS:
+            return "unknown", f"a flexible residual model explains {share:.1%} more of the error than {_list(there)}"
+    times = np.sqrt(mean_error(setup, best, told))
+    if not best.effects:
+        if there.effects:
+            return "none", f"nothing matters: {_list(there)} is there, and takes away less than {MATTERS:.0%}"
+        if settled(base):
+            return "none", "the nominal model's error is within noise and the simulator's floor"
+        tried = "no name" if residual_model is None else "no name and no flexible model"
+        return "none", f"{tried} explains the error, {times:.1f} times noise and floor, on windows that were not fitted"
+    if judge.leaves_much(best.error, base.error, LEFT):
+        return "unknown", f"{_list(best)} leaves {times:.1f} times noise and floor, which no name explains"
+    return "", ""
+
+
+def beats(setup: Setup[Any], residual_model: ResidualModel, best: Hypothesis, rng: np.random.Generator) -> bool:
+    """Whether something that no name in the library covers is clearly there."""
+    return not settled(best) and judge.credible(best.errors, residual_model.errors, rng, setup.parts)
+
+
+def _list(e: Hypothesis) -> str:
+    return " + ".join(e.names) or "the nominal model"

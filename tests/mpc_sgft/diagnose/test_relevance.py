@@ -1,0 +1,92 @@
+"""What is there and does not matter is a trace: it is no name, no tie, no repair."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from mpc_sgft.command.errors import UserError
+from mpc_sgft.diagnose import diagnose
+from mpc_sgft.diagnose.__main__ import main
+from mpc_sgft.diagnose.verdict.tolerance import limits_of, parse_tolerance
+
+FEW = ["viscous_friction", "coulomb_friction", "quadratic_drag", "actuator_offset"]
+Record = Callable[..., Path]
+
+
+def test_a_trace_beside_the_cause_is_listed_and_not_named(
+    slide: Path, record: Record, tmp_path: Path, check_report: Callable[[dict], None]
+) -> None:
+    data = record(coulomb=2.0, viscous=0.01, extra=lambda q, v: 0.01)
+    report = diagnose(slide, [data], effects=FEW, out=tmp_path / "plain").as_dict()
+    check_report(report)
+    (effect,) = report["effects"]
+    assert report["verdict"] == "effect" and effect["name"] == "coulomb_friction", report["reason"]
+    assert effect["share"]["value"] > 0.9 and effect["changes"][0]["signal"] == "qpos/x"
+    assert report["traces"] and {t["name"] for t in report["traces"]} <= {"viscous_friction", "actuator_offset"}
+    assert all(t["share"]["value"] < 0.01 for t in report["traces"])
+    assert list(yaml.safe_load((tmp_path / "plain" / "effects.yaml").read_text())["effects"]) == ["coulomb_friction"]
+    whole = diagnose(slide, [data], effects=FEW, out=tmp_path / "whole", traces=True).as_dict()
+    held = yaml.safe_load((tmp_path / "whole" / "effects.yaml").read_text())["effects"]
+    assert set(held) == {"coulomb_friction", *(t["name"] for t in report["traces"])}
+    assert whole["held_out"]["repaired"] < report["held_out"]["repaired"]
+
+
+def test_within_the_tolerance_nothing_is_missing(slide: Path, record: Record, tmp_path: Path) -> None:
+    out, data = tmp_path / "out", record(coulomb=0.1)
+    given = ["--model", str(slide), "--data", str(data), "--out", str(out), "--effects", ",".join(FEW)]
+    assert main(given) == 0
+    strict = json.loads((out / "report.json").read_text())
+    assert strict["verdict"] == "effect" and strict["effects_file"] == "effects.yaml", strict["reason"]
+    off = strict["held_out"]["nominal"]
+    assert main([*given, "--tolerance", f"qpos/x={4 * 1000 * off:g}mm"]) == 0
+    loose = json.loads((out / "report.json").read_text())
+    assert loose["verdict"] == "none" and "within the tolerance" in loose["reason"] and not loose["effects"]
+    assert [t["name"] for t in loose["traces"]] == ["coulomb_friction"]
+    assert loose["effects_file"] is None and not (out / "repaired.xml").exists() and not (out / "effects.yaml").exists()
+
+
+def test_a_repair_that_does_not_repair_is_not_written(slide: Path, record: Record, tmp_path: Path) -> None:
+    """Friction that came only after what is held out cannot be seen there."""
+    still = record(name="b", seconds=2.0)
+    rubbed = record(name="a", seconds=10.0, coulomb=2.0)
+    report = diagnose(
+        slide, [rubbed, still], effects=["coulomb_friction"], held_out=["b"], out=tmp_path / "out"
+    ).as_dict()
+    assert report["effects_file"] is None and not (tmp_path / "out" / "repaired.xml").exists()
+    assert any("no repaired.xml" in n for n in report["notes"]), report["notes"]
+
+
+def test_tolerances_have_units_of_their_signals() -> None:
+    signals, units, spread = ["qpos/a", "qpos/b"], ["m", "rad"], np.array([2.0, 0.5])
+    assert limits_of(parse_tolerance("1%"), signals, units, spread) == pytest.approx([0.02, 0.005])
+    assert limits_of(parse_tolerance("0.1"), signals, units, spread) == pytest.approx([0.2, 0.05])
+    assert limits_of(None, signals, units, spread) == pytest.approx([0.02, 0.005])
+    assert limits_of(parse_tolerance("qpos/a=0.5mm"), signals, units, spread) == pytest.approx([5e-4, np.inf])
+    both = limits_of(parse_tolerance("qpos/b=0.1deg, qpos/a=3"), signals, units, spread)
+    assert both == pytest.approx([3.0, 0.1 * np.pi / 180])
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("much", "write a share of the motion"),
+        ("120%", "between 0 and 1"),
+        ("0", "between 0 and 1"),
+        ("nan", "between 0 and 1"),
+        ("qpos/c=1mm", "no compared signal. There are: qpos/a, qpos/b"),
+        ("qpos/a=1deg", "Units that fit: m, cm, mm, um"),
+        ("qpos/a=-1mm", "a number above 0"),
+        ("qpos/a=", "no size of this signal"),
+        ("qpos/a=1e999", "a number above 0"),
+        ("qpos/a=1-2", "write a share of the motion"),
+    ],
+)
+def test_tolerances_that_cannot_be(text: str, words: str) -> None:
+    with pytest.raises(UserError, match=words):
+        limits_of(parse_tolerance(text), ["qpos/a", "qpos/b"], ["m", "rad"], np.ones(2))
