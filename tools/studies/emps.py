@@ -58,7 +58,13 @@ def thirds(folder: Path) -> list[Episode]:
 def verdict(episodes: list[Episode], spec: mujoco.MjSpec | None = None, **options: Any) -> Report:
     """What diagnose says of some recordings; options as of `mpc_sgft.diagnose.diagnose`."""
     given = {"out": None, "effects": None, "signals": None, "window": None, "held_out": None, "seed": 0}
-    given |= {"uncertain": {"mass": 0.3}, "max_effects": 3, "tolerance": None, "traces": False, "progress": False} | options
+    given |= {
+        "uncertain": {"mass": 0.3},
+        "max_effects": 3,
+        "tolerance": None,
+        "traces": False,
+        "progress": False,
+    } | options
     return run(Plant(spec or mujoco.MjSpec.from_string(SCENE)), episodes, **given)
 
 
