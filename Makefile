@@ -10,11 +10,12 @@ STAMP := .venv/.installed
 WORKERS ?= 2
 # Which of them: make test TESTS="tests/planners -k mppi"
 TESTS ?=
+BROWSER := chromium
 APT := mesa-vulkan-drivers libegl1 libegl-mesa0 libgl1-mesa-dri libosmesa6 libusb-1.0-0
 
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: help setup system robot demo test-setup test test-all docs check format clean
+.PHONY: help setup system packages robot demo test-setup test test-all docs check format clean
 
 help: ## List the targets.
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -32,7 +33,11 @@ $(STAMP): requirements.lock pyproject.toml
 	@$(BIN)/python -m pip install -q --no-deps --no-build-isolation -e .
 	@touch $(STAMP)
 
-system: ## Install the apt packages for rendering without a screen (root, or sudo that asks nothing).
+system: ## Install the apt packages for rendering and a browser without a screen (root, or sudo that asks nothing).
+	@$(MAKE) --no-print-directory packages APT="$(APT)"
+	@command -v chromium google-chrome > /dev/null || $(MAKE) --no-print-directory packages APT="$(BROWSER)"
+
+packages:
 	@missing=""; for p in $(APT); do [ "$$(dpkg-query -Wf '$${db:Status-Abbrev}' $$p 2> /dev/null)" = "ii " ] || missing="$$missing $$p"; done; \
 	sudo=""; [ "$$(id -u)" = 0 ] || sudo="sudo -n"; \
 	if [ -z "$$missing" ]; then echo "system packages: all there"; \

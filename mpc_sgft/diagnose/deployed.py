@@ -26,7 +26,7 @@ from mpc_sgft.diagnose.fitting.prepare import Setup, leave_out_blocks, split
 from mpc_sgft.diagnose.fitting.screening import Effort
 from mpc_sgft.diagnose.fitting.search import search
 from mpc_sgft.diagnose.report import Report
-from mpc_sgft.diagnose.rows import Shown, candidate_rows, effect_rows, reduction, trace_rows
+from mpc_sgft.diagnose.rows import Shown, candidate_rows, effect_rows, reduction, trace_rows, waterfall
 from mpc_sgft.diagnose.verdict import repair
 from mpc_sgft.diagnose.verdict.relevance import repairs
 from mpc_sgft.diagnose.verdict.tolerance import Predict, Tolerance, limits_of
@@ -169,6 +169,7 @@ def assemble(
         "effects": effect_rows(setup, verdict, hypotheses, rows) if shown else [],
         "traces": trace_rows(setup, verdict, hypotheses, rows),
         "candidates": candidate_rows(hypotheses, best, verdict, rng),
+        "waterfall": waterfall(setup, verdict, hypotheses, rows, seen(chain.observed, chain.drive)),
         "ties": [
             {"effects": e.names, "probability": verdict.probability[e.key], "held_out_error": e.error, "reason": reason}
             for e, reason in verdict.ties

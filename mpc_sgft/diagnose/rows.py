@@ -13,7 +13,7 @@ from mpc_sgft.diagnose.fitting import judge
 from mpc_sgft.diagnose.fitting.hypothesis import Hypothesis, without_effect
 from mpc_sgft.diagnose.fitting.prepare import Setup
 from mpc_sgft.diagnose.verdict.naming import effect_probability, intervals
-from mpc_sgft.diagnose.verdict.relevance import Relevance, by_window, foretold
+from mpc_sgft.diagnose.verdict.relevance import Relevance, by_window, foretold, mean_error
 from mpc_sgft.diagnose.verdict.tolerance import Predict
 from mpc_sgft.diagnose.verdict.verdict import Verdict
 
@@ -37,7 +37,7 @@ class Shown(NamedTuple):
 def effect_rows(
     setup: Setup[Any], verdict: Verdict, hypotheses: list[Hypothesis], shown: Shown
 ) -> list[dict[str, Any]]:
-    """What the report says of each named effect."""
+    """What the report says of each named effect, those that would be missed most first."""
     best, out = verdict.best, []
     bounds = intervals(best)
     wins = effect_probability(best, hypotheses, verdict.probability)
@@ -50,7 +50,7 @@ def effect_rows(
         for name, parameter in row["parameters"].items():
             parameter |= {"low": lows[name], "high": highs[name]}
         out.append(row | {"probability": win})
-    return out
+    return sorted(out, key=lambda row: -row["share"]["value"])
 
 
 def trace_rows(setup: Setup[Any], verdict: Verdict, hypotheses: list[Hypothesis], shown: Shown) -> list[dict[str, Any]]:
@@ -77,6 +77,40 @@ def _row(s: Relevance, value: Array, change: Array, shown: Shown) -> dict[str, A
             if np.isfinite(x)
         ],
     }
+
+
+def waterfall(
+    setup: Setup[Any], verdict: Verdict, hypotheses: list[Hypothesis], shown: Shown, measured: Array
+) -> list[dict[str, Any]]:
+    """Error of the worst signal on windows that were never fitted, as effects join the model, up to the noise.
+
+    Those that would be missed most join first; `measured` is [W, n, S].
+    """
+    sets, e, told = [], verdict.best, foretold(setup, verdict.there)
+    while e.effects:
+        sets.append(e)
+        less = [without_effect(setup, e, i, hypotheses) for i in range(e.effects)]
+        e = min(less, key=lambda h: mean_error(setup, h, told))
+    sets = [hypotheses[0], *sets[::-1]]
+    names = ["nominal", *(_added(a, b) for a, b in zip(sets, sets[1:], strict=False))]
+    if verdict.traces:
+        sets.append(verdict.there)
+        names.append("traces")
+    y = shown.predict([e.fit for e in sets])
+    errors = np.sqrt(((y - measured) ** 2)[:, setup.held].mean((1, 2)))  # [K, S]
+    noise = np.asarray(setup.noise[: errors.shape[1]])
+    worst = int(np.argmax(errors[0] / np.maximum(noise, 1e-12)))
+    signal, unit = list(shown.signals.items())[worst]
+    values = [*errors[:, worst], noise[worst]]
+    return [
+        {"what": what, "signal": signal, "unit": unit, "rms": float(x)}
+        for what, x in zip([*names, "noise"], values, strict=True)
+    ]
+
+
+def _added(small: Hypothesis, large: Hypothesis) -> str:
+    """What joins, in words."""
+    return "+ " + ", ".join(n for n in large.names if n not in small.names)
 
 
 def changes_of(setup: Setup[Any], e: Hypothesis, hypotheses: list[Hypothesis], predict: Predict) -> Array:

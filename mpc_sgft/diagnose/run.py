@@ -23,8 +23,9 @@ from mpc_sgft.diagnose.fitting.prepare import Setup, near_fit, prepare, typical_
 from mpc_sgft.diagnose.fitting.residual_model import fit_residual_model
 from mpc_sgft.diagnose.fitting.screening import key_of
 from mpc_sgft.diagnose.fitting.search import nearest, refit, search
+from mpc_sgft.diagnose.page.laws import laws
 from mpc_sgft.diagnose.report import Report
-from mpc_sgft.diagnose.rows import Shown, candidate_rows, effect_rows, reduction, trace_rows
+from mpc_sgft.diagnose.rows import Shown, candidate_rows, effect_rows, reduction, trace_rows, waterfall
 from mpc_sgft.diagnose.simulation.plant import SHARP, Change, Plant, joint_of
 from mpc_sgft.diagnose.simulation.replay import Replayer
 from mpc_sgft.diagnose.verdict import repair
@@ -122,6 +123,8 @@ def run(
     if out is not None:
         lowers = repairs(setup, held, verdict.there, hypotheses[0], rng)
         repair.into(out, report.data, held, lowers, lambda: repair.write(plant, held, out))
+        if report.data["repaired_model"]:
+            report.diff = repair.diff(plant, held)
     report.data["seconds"] = round(time.perf_counter() - began, 2)
     if out is not None:
         report.write(out)
@@ -183,6 +186,7 @@ def assemble(
         "effects": effect_rows(setup, verdict, hypotheses, rows) if shown else [],
         "traces": trace_rows(setup, verdict, hypotheses, rows),
         "candidates": candidate_rows(hypotheses, best, verdict, rng),
+        "waterfall": waterfall(setup, verdict, hypotheses, rows, measured),
         "ties": ties,
         "next_experiment": next_experiment(setup, tied) if len(tied) > 1 else "",
         "nominal_refit": refit_table(list(base.terms), list(best.fit.values[: len(base.terms)])),
@@ -199,7 +203,7 @@ def assemble(
         "effects_file": None,
         "notes": notes,
     }
-    return Report(data, measured, nominal, repaired, replayer)
+    return Report(data, measured, nominal, repaired, replayer, laws(setup, held.fit))
 
 
 def _signals(

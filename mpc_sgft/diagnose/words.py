@@ -78,17 +78,13 @@ def headline(report: Row) -> str:
         return f"Nothing that matters is missing: {report['reason']} ({error})."
     if kind == "unknown":
         return f"Something is missing that no name in the library covers: {report['reason']}."
-    said = _capital("; ".join(sentence(e) for e in report["effects"]))
+    said = "The model lacks this: " + "; ".join(sentence(e) for e in report["effects"])
     if kind == "not_identifiable":
         rivals = " or ".join(" + ".join(t["effects"]) for t in report["ties"])
         return f"{said}. Or it is {rivals}: these data cannot tell."
     fell = f"from {h['nominal']:.3g} to {h['repaired']:.3g} {h['unit']}"
-    return f"{said}: the model does not say so. With that in it, the error of {h['signal']} falls {fell}."
+    return f"{said}. With that in it, the error of {h['signal']} falls {fell}."
 
 
 def _more(x: float) -> str:
     return "more" if x >= 0 else "less"
-
-
-def _capital(text: str) -> str:
-    return text[:1].upper() + text[1:]

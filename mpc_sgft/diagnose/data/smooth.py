@@ -9,7 +9,7 @@ import numpy as np
 from scipy.ndimage import uniform_filter1d
 from scipy.signal import savgol_coeffs, savgol_filter
 
-from mpc_sgft.diagnose.data.measured import Array, Episode
+from mpc_sgft.diagnose.data.measured import Array, Episode, Index
 
 HALF_WIDTHS = (2, 3, 5, 8, 12, 18, 27, 40)  # samples
 
@@ -22,6 +22,7 @@ class Smooth(NamedTuple):
         noise: Standard deviation of the position noise.
         q_sd, v_sd: How uncertain q and v are, [T, nj], but for the ends; more where the motion has corners.
         half: Samples at either end of the episode where they are more uncertain, a number.
+        spread: Samples of the true acceleration that each `a` is a mean of, [nj], odd.
     """
 
     q: Array
@@ -31,6 +32,7 @@ class Smooth(NamedTuple):
     q_sd: Array
     v_sd: Array
     half: int
+    spread: Index
 
 
 def noise_of(x: Array) -> float:
@@ -51,8 +53,17 @@ def noise_of(x: Array) -> float:
 def smooth(episode: Episode, joints: Sequence[str]) -> Smooth:
     """Smooth every joint of an episode; measured velocities are used where they are better than derived ones."""
     columns = [_one(episode.signals[f"qpos/{j}"], episode.signals.get(f"qvel/{j}"), episode.dt) for j in joints]
-    q, v, a, noise, q_sd, v_sd, half = (np.stack(parts, -1) for parts in zip(*columns, strict=True))
-    return Smooth(q, v, a, noise, q_sd, v_sd, int(half.max()))
+    q, v, a, noise, q_sd, v_sd, half, wide = (np.stack(parts, -1) for parts in zip(*columns, strict=True))
+    return Smooth(q, v, a, noise, q_sd, v_sd, int(half.max()), wide)
+
+
+def averaged(force: Array, spread: int) -> Array:
+    """A force [T] as `Smooth.a` of that spread shows the acceleration that it makes.
+
+    The second derivative of a local cubic is a weighted mean of the true one: its coefficients, summed up twice.
+    """
+    kernel = np.cumsum(np.cumsum(savgol_coeffs(spread, 3, deriv=2)))[:-2]
+    return np.convolve(np.pad(force, len(kernel) // 2, mode="edge"), kernel, mode="valid")
 
 
 def _one(q: Array, measured_v: Array | None, dt: float) -> tuple[Array, ...]:
@@ -60,13 +71,14 @@ def _one(q: Array, measured_v: Array | None, dt: float) -> tuple[Array, ...]:
     level, q_sd, _ = _best(q, noise, dt, 0)
     v, v_sd, width = _best(q, noise, dt, 1)
     wide = min(2 * width + 1, (len(q) // 2) * 2 - 1)
-    a = np.asarray(savgol_filter(q, max(wide, 5), 3, deriv=2, delta=dt), float)
+    wide = max(wide, 5)
+    a = np.asarray(savgol_filter(q, wide, 3, deriv=2, delta=dt), float)
     if measured_v is not None:
         own = noise_of(measured_v)
         lag = float(np.clip(np.sum((v - measured_v) * a) / max(np.sum(a * a), 1e-30), -dt, dt))
         if own < np.sqrt(np.mean(v_sd**2)):
             v, v_sd = measured_v + lag * a, np.full(len(q), own)
-    return level, v, a, np.array(noise), q_sd, v_sd, np.array(width // 2)
+    return level, v, a, np.array(noise), q_sd, v_sd, np.array(width // 2), np.array(wide)
 
 
 def _best(q: Array, noise: float, dt: float, order: int) -> tuple[Array, Array, int]:

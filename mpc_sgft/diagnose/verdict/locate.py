@@ -8,8 +8,9 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from mpc_sgft.diagnose.data.measured import Array
-from mpc_sgft.diagnose.fitting.fit import change_of
+from mpc_sgft.diagnose.data.measured import Array, Index
+from mpc_sgft.diagnose.data.smooth import averaged
+from mpc_sgft.diagnose.fitting.fit import Fit, change_of
 from mpc_sgft.diagnose.fitting.prepare import Setup
 from mpc_sgft.diagnose.simulation.plant import Plant, joint_of
 
@@ -70,19 +71,39 @@ def regimes(plant: Plant, joint: str, v: Array, u: Array) -> dict[str, NDArray[n
     return {name: mask for name, mask in masks.items() if mask.any()}
 
 
-def missing_force(setup: Setup) -> tuple[Array, Array, Array, Array]:
-    """Force that the baseline lacks along the recorded motion [M, nj] N or N m, with position, speed, command."""
-    replayer = setup.problem.replayer
-    model = replayer.plant.compile(change_of(setup.baseline.terms, setup.baseline.values))
+def missing_force(setup: Setup, f: Fit | None = None) -> tuple[Array, Array, Array, Array]:
+    """Force that a fit lacks along the recorded motion [M, nj] N or N m, with position, speed, command.
+
+    Args:
+        setup: With the recorded motion.
+        f: Of forces and of gains and offsets of commands; the baseline if None.
+    """
+    replayer, f = setup.problem.replayer, f or setup.baseline
+    change = change_of(f.terms, f.values)
+    model = replayer.plant.compile(change)
     data = mujoco.MjData(model)
     q, v, a = (np.concatenate([getattr(s, k)[2:-2] for s in replayer.smooth]) for k in "qva")
-    u = np.concatenate([e.ctrl[2:-2] for e in replayer.episodes])
+    sent = [e.ctrl for e in replayer.episodes]
+    u = np.concatenate([x[2:-2] for x in sent])
+    for command in change.commands:
+        sent = [command(x, replayer.dt) for x in sent]
+    wide = {j: i for i, j in enumerate(replayer.plant.joints)}
+    at = [wide.get(joint_of(replayer.plant, a) or "", 0) for a in replayer.plant.actuators]
+    acting = np.concatenate(
+        [_as_accelerations(x, sm.spread[at])[2:-2] for x, sm in zip(sent, replayer.smooth, strict=True)]
+    )
     pick = np.unique(np.linspace(0, len(q) - 1, POINTS).astype(int))
     out = np.empty((len(pick), model.nv))
     for row, k in enumerate(pick):
-        data.qpos[:], data.qvel[:], data.qacc[:], data.ctrl[:] = q[k], v[k], a[k], u[k]
+        data.qpos[:], data.qvel[:], data.qacc[:], data.ctrl[:] = q[k], v[k], a[k], acting[k]
         mujoco.mj_inverse(model, data)
         needed = data.qfrc_inverse.copy()
         mujoco.mj_fwdActuation(model, data)
         out[row] = needed - data.qfrc_actuator
     return out, q[pick], v[pick], u[pick]
+
+
+def _as_accelerations(ctrl: Array, spread: Index) -> Array:
+    """Commands [T, nu] as far as smoothed accelerations show them: a command is held, before a sample and after it."""
+    around = (np.concatenate([ctrl[:1], ctrl[:-1]]) + ctrl) / 2
+    return np.stack([averaged(x, int(w)) for x, w in zip(around.T, spread, strict=True)], 1) if ctrl.size else ctrl

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from difflib import unified_diff
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,17 @@ from mpc_sgft.diagnose.candidates.library import as_gap, settings
 from mpc_sgft.diagnose.candidates.nominal import scale
 from mpc_sgft.diagnose.fitting.hypothesis import Hypothesis
 from mpc_sgft.diagnose.simulation.plant import FORCE, Plant
+
+
+def diff(plant: Plant, held: Hypothesis) -> str:
+    """What the repair changes in the scene, as a unified diff of its MJCF."""
+    nothing = held._replace(fit=held.fit._replace(terms=(), values=()))
+    texts = []
+    for h in (nothing, held):
+        spec, _ = repaired_spec(plant, h)
+        spec.compile()
+        texts.append(spec.to_xml().splitlines())
+    return "\n".join(unified_diff(texts[0], texts[1], fromfile="nominal", tofile="repaired", n=2, lineterm=""))
 
 
 def repaired_spec(plant: Plant, best: Hypothesis) -> tuple[mujoco.MjSpec, list[str]]:

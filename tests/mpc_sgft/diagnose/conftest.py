@@ -97,6 +97,7 @@ REPORT = {  # key of report.json -> type, or {key: type} of each item
     "effects": {"name": str, "at": list, "parameters": dict, "probability": float, "share": dict, "changes": list},
     "traces": {"name": str, "at": list, "parameters": dict, "share": dict, "changes": list},
     "candidates": {"effects": list, "held_out_error": float, "low": float, "high": float, "probability": float},
+    "waterfall": {"what": str, "signal": str, "unit": str, "rms": float},
     "ties": {"effects": list, "probability": float, "held_out_error": float, "reason": str},
     "next_experiment": str,
     "nominal_refit": dict,

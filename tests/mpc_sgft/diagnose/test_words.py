@@ -42,7 +42,10 @@ def test_an_effect_that_has_no_sentence_is_told_by_its_numbers() -> None:
 @pytest.mark.parametrize(
     ("verdict", "words"),
     [
-        ("effect", "Body forearm carries 0.28 kg more: the model does not say so. With that in it"),
+        (
+            "effect",
+            "The model lacks this: body forearm carries 0.28 kg more. With that in it, the error of qpos/elbow falls",
+        ),
         ("not_identifiable", "Or it is armature@elbow: these data cannot tell."),
         ("none", "Nothing that matters is missing: within noise (0.05 rad of qpos/elbow)."),
         ("unknown", "Something is missing that no name in the library covers: within noise."),

@@ -1,0 +1,1 @@
+"""report.html: what an engineer would put before a colleague."""
