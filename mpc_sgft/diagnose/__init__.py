@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     import mujoco
 
+    from mpc_sgft.diagnose.data.mapping import Source
     from mpc_sgft.diagnose.report import Report
 
 __all__ = ["diagnose"]
@@ -38,6 +39,7 @@ def diagnose(
     max_effects: int = 3,
     tolerance: float | Mapping[str, float | str] | None = None,
     traces: bool = False,
+    mapping: Mapping[str, str | Source] | None = None,
     progress: bool = False,
 ) -> Report:
     """Compare a model with measurements and say what it lacks.
@@ -59,18 +61,21 @@ def diagnose(
             number in its unit or with a unit of its own ("0.5mm"), and then other signals do not count. If None,
             whatever takes away a hundredth of the squared error matters.
         traces: Whether repaired.xml and effects.yaml hold effects that are there and do not matter, too.
+        mapping: Our column -> what it is made of, {"qpos/elbow": "-1*encoder deg + 0.1"}, where files name or measure
+            things otherwise.
         progress: Show a progress bar on stderr.
 
     Raises:
         UserError: For data or a model that cannot be used; the message says what came and what to do.
     """
+    from mpc_sgft.diagnose.data.mapping import parse_mapping
     from mpc_sgft.diagnose.run import read, run
     from mpc_sgft.diagnose.simulation.plant import load_plant
 
     plant = load_plant(model)
     return run(
         plant,
-        read(plant, data),
+        read(plant, data, parse_mapping(mapping or {})),
         out=out,
         effects=effects,
         signals=signals,

@@ -5,6 +5,10 @@ from __future__ import annotations
 import argparse
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from mpc_sgft.diagnose.data.mapping import Source
 
 
 def parser() -> argparse.ArgumentParser:
@@ -28,6 +32,18 @@ def parser() -> argparse.ArgumentParser:
     )
     p.add_argument(
         "--retrain-transitions", type=int, default=60_000, metavar="N", help="how long; default 60000, a few minutes"
+    )
+    p.add_argument(
+        "--map",
+        metavar="FILE|A=B,...",
+        help="columns of other names, units and signs: map.yaml, or 'time=t ms,qpos/elbow=-1*enc deg + 0.1'",
+    )
+    p.add_argument(
+        "--inspect",
+        type=Path,
+        nargs="+",
+        metavar="PATH",
+        help="say what is in recordings, what maps to what (with --model), gaps, rates and excitation, and stop",
     )
     p.add_argument("--effects", metavar="A,B", help="consider only these effects")
     p.add_argument("--signals", metavar="A,B", help="compare only these columns, such as qpos/elbow")
@@ -73,6 +89,8 @@ def _run(args: argparse.Namespace) -> int:
     from mpc_sgft.command.errors import UserError
     from mpc_sgft.diagnose import diagnose
 
+    if args.inspect is not None:
+        return _inspect(args)
     if args.run is not None:
         return _run_folder(args)
     if args.retrain:
@@ -94,6 +112,7 @@ def _run(args: argparse.Namespace) -> int:
         max_effects=args.max_effects,
         tolerance=_tolerance(args.tolerance),
         traces=args.traces,
+        mapping=_mapping(args.map),
         progress=True,
     )
     print(report.summary())
@@ -101,11 +120,19 @@ def _run(args: argparse.Namespace) -> int:
     return 0
 
 
+def _inspect(args: argparse.Namespace) -> int:
+    from mpc_sgft.diagnose.data.inspect import inspect
+    from mpc_sgft.diagnose.simulation.plant import load_plant
+
+    print(inspect(args.inspect, None if args.model is None else load_plant(args.model), _mapping(args.map)))
+    return 0
+
+
 def _run_folder(args: argparse.Namespace) -> int:
     from mpc_sgft.command.errors import UserError
     from mpc_sgft.diagnose.deployed import diagnose_run
 
-    for name in ("model", "data", "signals", "uncertain"):
+    for name in ("model", "data", "signals", "uncertain", "map"):
         if getattr(args, name) is not None:
             raise UserError(f"--{name} does not go with --run, which brings its own scene and episodes; leave it out.")
     if args.retrain_transitions < 1:
@@ -152,6 +179,12 @@ def _held_out(text: str | None) -> float | list[str] | None:
         return None if text is None else float(text)
     except ValueError:
         return _names(text)
+
+
+def _mapping(text: str | None) -> dict[str, Source] | None:
+    from mpc_sgft.diagnose.data.mapping import read_mapping
+
+    return None if text is None else read_mapping(text)
 
 
 def _tolerance(text: str | None) -> float | dict[str, str] | None:

@@ -15,6 +15,7 @@ from mpc_sgft.command.errors import UserError
 from mpc_sgft.diagnose.candidates.library import Term, candidates
 from mpc_sgft.diagnose.candidates.nominal import nominal_terms, refit_table
 from mpc_sgft.diagnose.data.check import check_settings, episodes
+from mpc_sgft.diagnose.data.mapping import Source, mapped
 from mpc_sgft.diagnose.data.measured import Array, Episode, files, read_table
 from mpc_sgft.diagnose.fitting import judge
 from mpc_sgft.diagnose.fitting.fit import Fit, Problem, change_of
@@ -42,14 +43,23 @@ STEPS = (4 * SHARP, 2 * SHARP, SHARP)  # [s] to simulate with: the longest whose
 UNSEEN, NOTHING = 0.2, 0.1  # share of the expected squared error that noise hides in a search, and in a judgement
 
 
-def read(plant: Plant, data: Sequence[str | Path]) -> list[Episode]:
+def read(plant: Plant, data: Sequence[str | Path], mapping: Mapping[str, Source] | None = None) -> list[Episode]:
     """All episodes of the files, on one clock.
+
+    Args:
+        plant: The model.
+        data: Files and folders.
+        mapping: Columns of other names, units and signs.
 
     Raises:
         UserError: If they are not usable or do not share a sample time.
     """
     axes, servos = plant.axes(), plant.servos()
-    found = [e for path in files(data) for e in episodes(read_table(path), plant.actuators, axes, servos)]
+    found = [
+        e
+        for path in files(data)
+        for e in episodes(mapped(read_table(path), mapping or {}), plant.actuators, axes, servos)
+    ]
     steps = [e.dt for e in found]
     if max(steps) > 1.05 * min(steps):
         raise UserError(
