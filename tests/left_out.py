@@ -15,6 +15,7 @@ import pytest
 NEEDS = {  # what a test may need, and what brings it
     "a GPU": "a machine with CUDA",
     "a renderer": "make system",
+    "a browser": "make system",
     "the robot's client": "make robot",
     "the camera's packages": "make system setup",
     "wandb": "make setup",

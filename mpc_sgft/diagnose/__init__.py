@@ -5,9 +5,10 @@
     report = diagnose_run(Path("runs/push/latest"))  # from mpc_sgft.diagnose.deployed: what deploy recorded
 
 `run` goes the whole way from files to a report, `deployed` from a deployment's run folder. Each room builds on those
-before it: `data` (read, check, smooth, cut), `simulation` (the nominal model over measured windows), `candidates` (what
-may be missing), `fitting` (how well a set of effects explains the data), `verdict` (its name, where it shows, the
-repair), `deployments` (a task's actions and observations in place of joint signals).
+before it: `data` (read, map, check, smooth, cut), `simulation` (the nominal model over measured windows), `candidates`
+(what may be missing), `fitting` (how well a set of effects explains the data), `verdict` (its name, whether it matters,
+where it shows, the repair), `page` (report.html), `deployments` (a task's actions and observations in place of joint
+signals). `inspect` says what is in recordings before anything runs.
 """
 
 from __future__ import annotations

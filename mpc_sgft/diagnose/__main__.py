@@ -121,7 +121,7 @@ def _run(args: argparse.Namespace) -> int:
 
 
 def _inspect(args: argparse.Namespace) -> int:
-    from mpc_sgft.diagnose.data.inspect import inspect
+    from mpc_sgft.diagnose.inspect import inspect
     from mpc_sgft.diagnose.simulation.plant import load_plant
 
     print(inspect(args.inspect, None if args.model is None else load_plant(args.model), _mapping(args.map)))

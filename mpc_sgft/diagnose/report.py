@@ -12,9 +12,9 @@ import numpy as np
 
 from mpc_sgft.diagnose.data.measured import Array
 from mpc_sgft.diagnose.page.laws import Law
-from mpc_sgft.diagnose.page.page import page
+from mpc_sgft.diagnose.page.page import Lines, page
+from mpc_sgft.diagnose.page.words import changes, headline, place
 from mpc_sgft.diagnose.simulation.replay import Replayer
-from mpc_sgft.diagnose.words import headline, place
 
 
 @dataclass
@@ -47,15 +47,16 @@ class Report:
     def write(self, out: Path) -> None:
         """Write report.json, report.html and report.rrd into a folder."""
         (out / "report.json").write_text(json.dumps(self.data, indent=2))
-        (out / "report.html").write_text(page(self))
+        (out / "report.html").write_text(page(self.data, self.lines(), self.laws, self.diff))
         write_rrd(self, out / "report.rrd")
 
-    def times(self) -> Array:
-        """Time of every predicted sample, episodes one after the other, [W, n] s."""
+    def lines(self) -> Lines:
+        """All signals over time."""
         w, replayer = self.replayer.windows, self.replayer
         before = np.concatenate([[0.0], np.cumsum([e.seconds for e in replayer.episodes])])
         after = np.arange(1, w.samples + 1)
-        return np.asarray(before[w.episode][:, None] + replayer.dt * (w.start[:, None] + after), float)
+        time = np.asarray(before[w.episode][:, None] + replayer.dt * (w.start[:, None] + after), float)
+        return Lines(replayer.signals, time, self.measured, self.nominal, self.repaired)
 
     def summary(self) -> str:
         """A few lines for the terminal."""
@@ -88,8 +89,8 @@ def _unit(parameter: dict[str, Any]) -> str:
 
 def _share(effect: dict[str, Any]) -> str:
     """What an effect does, in words."""
-    changes = ", ".join(f"{c['signal']} by {c['rms']:.2g} {c['unit']}" for c in effect["changes"][:3])
-    return f"{effect['share']['value']:.2%} of the squared error" + (f", moves {changes}" if changes else "")
+    moved = ", ".join(changes(effect))
+    return f"{effect['share']['value']:.2%} of the squared error" + (f", moves {moved}" if moved else "")
 
 
 def write_rrd(report: Report, path: Path) -> None:
@@ -98,7 +99,7 @@ def write_rrd(report: Report, path: Path) -> None:
 
     rec = rr.RecordingStream("mpc_sgft_diagnose")
     rec.save(str(path))
-    t = report.times()
+    t = report.lines().time
     order = np.argsort(t.ravel())
     index = [rr.TimeColumn("time", duration=t.ravel()[order])]
     for i, name in enumerate(report.replayer.signals):

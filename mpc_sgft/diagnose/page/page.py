@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import html
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -12,10 +12,7 @@ from mpc_sgft.diagnose.data.measured import Array
 from mpc_sgft.diagnose.page.charts import BOTTOM, TOP, Chart, span, thinned
 from mpc_sgft.diagnose.page.laws import Law
 from mpc_sgft.diagnose.page.style import CSS, SCRIPT
-from mpc_sgft.diagnose.words import headline, sentence
-
-if TYPE_CHECKING:
-    from mpc_sgft.diagnose.report import Report
+from mpc_sgft.diagnose.page.words import changes, headline, sentence
 
 POINTS = 36_000  # of all lines of all signals: more make the page heavy, and no screen shows them
 DOTS = 1500  # of a law
@@ -26,17 +23,32 @@ NAMES, TOLD = 250, 130  # pixels beside the bars
 SERIES = ("measured", "nominal", "repaired")
 
 
-def page(report: Report) -> str:
-    """One self-contained HTML page."""
-    d = report.data
+class Lines(NamedTuple):
+    """Signals over time, of all windows.
+
+    Attributes:
+        names: Of the signals.
+        time: Of every predicted sample, episodes one after the other, [W, n] s.
+        measured, nominal, repaired: [W, n, S].
+    """
+
+    names: Sequence[str]
+    time: Array
+    measured: Array
+    nominal: Array
+    repaired: Array
+
+
+def page(d: Mapping[str, Any], lines: Lines, laws: Sequence[Law], diff: str) -> str:
+    """One self-contained HTML page of a report.json, signals, what force is missing, and the scene's change."""
     sections = [
         _head(d),
         _waterfall(d),
-        _laws(report.laws),
-        _signals(report),
+        _laws(laws),
+        _signals(d, lines),
         _candidates(d),
         _traces(d),
-        _diff(report.diff, d),
+        _diff(diff, d),
         _rest(d),
     ]
     return (
@@ -53,13 +65,13 @@ def _head(d: Mapping[str, Any]) -> str:
     lines = [f"<p class='soft'>Held out, never fitted: {_e(h['signal'])} {h['nominal']:.3g} → {h['repaired']:.3g} "]
     lines[0] += f"{_e(h['unit'])}, {fell}. {_e(_capital(d['reason']))}.</p>"
     named = "".join(
-        f"<tr><td>{_e(_capital(sentence(e)))}<td>{_parameters(e)}<td>{e['share']['value']:.1%}<td>{_changes(e)}</tr>"
+        f"<tr><td>{_e(_capital(sentence(e)))}<td>{_parameters(e)}<td>{e['share']['value']:.1%}<td>{_moves(e)}</tr>"
         for e in d["effects"]
     )
     if named:
         lines.append(
             "<div class='wide'><table><tr><th>What<th>Parameters, 90 % interval<th>Share of the squared error"
-            f"<th>Moves predictions by</tr>{named}</table></div>"
+            f"<th>Moves predictions of</tr>{named}</table></div>"
         )
     if d["next_experiment"]:
         lines.append(f"<div class='next'><b>Next experiment.</b> {_e(_capital(d['next_experiment']))}</div>")
@@ -127,21 +139,20 @@ def _laws(laws: Sequence[Law]) -> str:
     )
 
 
-def _signals(report: Report) -> str:
-    names = report.replayer.signals[:SIGNALS]
-    units = {s["signal"]: s["unit"] for s in report.data["signals"]}
-    t = report.times()
+def _signals(d: Mapping[str, Any], lines: Lines) -> str:
+    names, t = lines.names[:SIGNALS], lines.time
+    units = {s["signal"]: s["unit"] for s in d["signals"]}
     W, n = t.shape
     pick = list(thinned(n, max(2, POINTS // (len(SERIES) * max(1, len(names)) * W))))
     gap = np.full((W, 1), np.nan)  # windows start anew at the measured state
     x = np.concatenate([t[:, pick], t[:, -1:]], 1).ravel()
     figures = []
     for i, name in enumerate(names):
-        lines = [getattr(report, kind)[..., i][:, pick] for kind in SERIES]
+        values = [getattr(lines, kind)[..., i][:, pick] for kind in SERIES]
         chart = Chart(
-            900, 230, span(t), span(*lines[:1], lines[2]), ("time [s]", f"{name} [{units.get(name, '')}]"), zoom=True
+            900, 230, span(t), span(values[0], values[2]), ("time [s]", f"{name} [{units.get(name, '')}]"), zoom=True
         )
-        for kind, y in zip(SERIES, lines, strict=True):
+        for kind, y in zip(SERIES, values, strict=True):
             chart.line(x, np.concatenate([y, gap], 1).ravel(), kind)
         figures.append(f"<figure>{chart.svg(f'{name}: measured, nominal and repaired')}</figure>")
     return (
@@ -182,11 +193,11 @@ def _traces(d: Mapping[str, Any]) -> str:
     if not d["traces"]:
         return ""
     rows = "".join(
-        f"<tr><td>{_e(_capital(sentence(e)))}<td>{e['share']['value']:.2%}<td>{_changes(e)}</tr>" for e in d["traces"]
+        f"<tr><td>{_e(_capital(sentence(e)))}<td>{e['share']['value']:.2%}<td>{_moves(e)}</tr>" for e in d["traces"]
     )
     return (
         "<h2>There, but too small to matter</h2><div class='wide'><table><tr><th>Trace<th>Share of the squared error"
-        f"<th>Moves predictions by</tr>{rows}</table></div>"
+        f"<th>Moves predictions of</tr>{rows}</table></div>"
     )
 
 
@@ -231,8 +242,8 @@ def _parameters(effect: Mapping[str, Any]) -> str:
     )
 
 
-def _changes(effect: Mapping[str, Any]) -> str:
-    return "<br>".join(f"{_e(c['signal'])} {c['rms']:.2g} {_e(c['unit'])}" for c in effect["changes"][:3])
+def _moves(effect: Mapping[str, Any]) -> str:
+    return "<br>".join(_e(c) for c in changes(effect))
 
 
 def _keys(kinds: Sequence[str]) -> str:

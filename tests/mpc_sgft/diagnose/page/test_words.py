@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from mpc_sgft.diagnose.candidates.effect_facts import effect_class, possible
-from mpc_sgft.diagnose.words import SAYS, headline, sentence
+from mpc_sgft.diagnose.page.words import SAYS, changes, headline, sentence
 
 HELD = {"signal": "qpos/elbow", "unit": "rad", "nominal": 0.05, "repaired": 0.001}
 
@@ -56,3 +56,13 @@ def test_the_headline_says_the_verdict(verdict: str, words: str) -> None:
     ties = [{"effects": ["armature@elbow"]}]
     said = headline({"verdict": verdict, "reason": "within noise", "effects": effects, "ties": ties, "held_out": HELD})
     assert words in said
+
+
+def test_signals_that_move_most_come_first_and_those_that_rest_not_at_all() -> None:
+    moved = [("a", 0.0), ("b", 0.1), ("c", 0.5), ("d", 0.01), ("e", 0.2)]
+    effect = {"changes": [{"signal": n, "unit": "rad", "rms": x} for n, x in moved]}
+    assert changes(effect) == ["c by 0.5 rad", "e by 0.2 rad", "b by 0.1 rad"]
+
+
+def test_an_effect_without_a_place_is_everywhere() -> None:
+    assert sentence(row("actuator_delay", [], delay=(0.2, "s"))) == "commands of every actuator arrive 0.2 s late"

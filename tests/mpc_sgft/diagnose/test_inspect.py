@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from mpc_sgft.diagnose.__main__ import main
-from mpc_sgft.diagnose.data.inspect import inspect, reversals
 from mpc_sgft.diagnose.data.measured import write_csv
+from mpc_sgft.diagnose.inspect import inspect, reversals
 from mpc_sgft.diagnose.simulation.plant import load_plant
 
 

@@ -61,13 +61,18 @@ def sentence(effect: Row) -> str:
 
 def place(effect: Row) -> str:
     """Where an effect is, such as "joint elbow"."""
-    names = ", ".join(effect["at"])
+    names, kind = ", ".join(effect["at"]), effect_class(effect["name"]).place
     if not names:
-        return "the scene"
-    kind = effect_class(effect["name"]).place
+        return f"every {kind}" if kind in ("joint", "actuator") else "the scene"
     if kind not in ("joint", "actuator", "body"):
         return names
     return f"{kind} {names}" if len(effect["at"]) == 1 else f"each of the {kind}s {names}"
+
+
+def changes(effect: Row) -> list[str]:
+    """By how much predictions move without an effect: the signals that move most."""
+    moved = sorted((c for c in effect["changes"] if c["rms"]), key=lambda c: -c["rms"])
+    return [f"{c['signal']} by {c['rms']:.2g} {c['unit']}" for c in moved[:3]]
 
 
 def headline(report: Row) -> str:
