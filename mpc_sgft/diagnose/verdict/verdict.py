@@ -59,8 +59,7 @@ def reach_verdict(
     """
     base, there = hypotheses[0], choose(setup, hypotheses, rng)
     best, traces = what_matters(setup, there, hypotheses, rng, tolerance)
-    good_enough = tolerance.allows(base.fit)
-    if good_enough:
+    if tolerance.allows(base.fit):
         traces, best = [*shares_of(setup, best, there, hypotheses, rng), *traces], base
     probability = dict.fromkeys((e.key for e in hypotheses), 0.0)
     rivals = [e for e in hypotheses if e.complexity <= 1 or no_larger(e, best)]  # larger sets are no more credible
@@ -70,9 +69,7 @@ def reach_verdict(
     probability |= {e.key: float(s) for e, s in zip(rivals, wins, strict=True)}
     best, ties = as_given(setup, best, find_ties(setup, best, hypotheses, rng))
     declared = [(e, equivalence(best, e)) for e in ties]
-    kind, reason = _no_name(setup, there, best, base, None if tolerance.allows(there.fit) else residual_model, rng)
-    if good_enough:
-        kind, reason = "none", "the nominal model's error is within the tolerance"
+    kind, reason = _no_name(setup, there, best, base, residual_model, rng, tolerance)
     if kind:
         named = [(e, "" if q is None else q.reason) for e, q in declared] if kind == "unknown" else []
     else:
@@ -97,6 +94,7 @@ def _no_name(
     base: Hypothesis,
     residual_model: ResidualModel | None,
     rng: np.random.Generator,
+    tolerance: Tolerance,
 ) -> tuple[str, str]:
     """ "unknown" or "none" with the reason; empty words where there is a name.
 
@@ -107,9 +105,12 @@ def _no_name(
         base: The nominal model.
         residual_model: On top of `there`.
         rng: For the bootstrap.
+        tolerance: Prediction errors that may not matter.
     """
+    if tolerance.allows(base.fit):
+        return "none", "the nominal model's error is within the tolerance"
     told = foretold(setup, there)
-    if residual_model is not None and beats(setup, residual_model, there, rng):
+    if residual_model is not None and not tolerance.allows(there.fit) and beats(setup, residual_model, there, rng):
         missed = float((told * (setup.squared(there.errors) - setup.squared(residual_model.errors))).mean())
         share = missed / mean_error(setup, base, told)
         if share > MATTERS:
@@ -117,12 +118,12 @@ def _no_name(
     times = np.sqrt(mean_error(setup, best, told))
     if not best.effects:
         if there.effects:
-            return "none", f"nothing matters: {_list(there)} is there, and takes away less than {MATTERS:.0%}"
+            return "none", f"{_list(there)} is there, and too small to matter"
         if settled(base):
             return "none", "the nominal model's error is within noise and the simulator's floor"
         tried = "no name" if residual_model is None else "no name and no flexible model"
         return "none", f"{tried} explains the error, {times:.1f} times noise and floor, on windows that were not fitted"
-    if judge.leaves_much(best.error, base.error, LEFT):
+    if not tolerance.allows(best.fit) and judge.leaves_much(best.error, base.error, LEFT):
         return "unknown", f"{_list(best)} leaves {times:.1f} times noise and floor, which no name explains"
     return "", ""
 

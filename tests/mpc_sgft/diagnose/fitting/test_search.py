@@ -340,3 +340,18 @@ def test_a_richer_set_is_fitted_again_from_where_the_simpler_one_ended(monkeypat
     rich = {name: [start for names, start in c if names == ["stribeck_friction"]] for name, c in calls.items()}
     assert len(rich["search"]) == 2
     assert any(abs(s[0] - 2) < 0.2 and s[1] == 0 and s[2] == 0.5 for s in rich["sharpen"])
+
+
+@pytest.mark.parametrize(("limit", "kind"), [(0.5, "unknown"), (1.1, "effect"), (4.0, "none")])
+def test_what_is_left_within_the_tolerance_is_no_unknown(limit: float, kind: str) -> None:
+    """Half of the error has a name; the rest is as large, and no name's."""
+    problem, fitted, none, rng = Lines(), np.arange(18), np.zeros(1), np.random.default_rng(5)
+    rest = 3 * rng.normal(size=problem.y.shape)
+    problem.y = 6 * problem.columns["b"] + rest
+    setup = Setup(problem, fitted, np.arange(18, 24), fitted // 3, fit(problem, [], [], fitted), none, none, np.log1p)
+    setup = replace(setup, squared=np.expm1)
+    named = judge_fit(setup, fit(problem, [term("b")], [np.ones(1)], fitted))
+    allowed = motion(problem, limit * float(np.sqrt((rest**2).mean() - 1)) / float(problem.y.std()), asked=True)
+    verdict = reach_verdict(setup, [judge_fit(setup, setup.baseline), named], None, rng, allowed)
+    assert verdict.kind == kind, verdict.reason
+    assert [t.term.effect for t in verdict.traces] == (["b"] if kind == "none" else [])
