@@ -67,6 +67,7 @@ def test_no_error_and_no_sideways_scroll_in_a_browser(width: int, report: Path, 
         "onload='document.title = this.contentDocument.title'></iframe>"
     )
     given = ["--headless", "--no-sandbox", "--disable-gpu", "--allow-file-access-from-files", "--enable-logging=stderr"]
+    given += ["--no-first-run", "--disable-background-networking", "--disable-component-update", "--disable-sync"]
     given += [f"--user-data-dir={tmp_path / 'profile'}", "--virtual-time-budget=5000", "--window-size=1600,1000"]
     ran = subprocess.run(
         [browser, *given, "--dump-dom", frame.as_uri()], capture_output=True, text=True, timeout=120, check=True
