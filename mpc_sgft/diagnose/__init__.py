@@ -60,7 +60,7 @@ def diagnose(
         max_effects: Largest set of effects.
         tolerance: Prediction error that does not matter: a share of each signal's standard deviation, or signal ->
             number in its unit or with a unit of its own ("0.5mm"), and then other signals do not count. If None,
-            whatever takes away a hundredth of the squared error matters.
+            an effect matters that takes away a hundredth of the squared error, or moves a signal by one of its motion.
         traces: Whether repaired.xml and effects.yaml hold effects that are there and do not matter, too.
         mapping: Our column -> what it is made of, {"qpos/elbow": "-1*encoder deg + 0.1"}, where files name or measure
             things otherwise.

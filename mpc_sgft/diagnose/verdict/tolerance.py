@@ -9,19 +9,18 @@ from dataclasses import dataclass
 import numpy as np
 
 from mpc_sgft.command.errors import UserError
+from mpc_sgft.diagnose.data.mapping import UNITS
 from mpc_sgft.diagnose.data.measured import Array
 from mpc_sgft.diagnose.fitting.fit import Fit
 
 Predict = Callable[[Sequence[Fit]], Array]  # K fits -> predictions of all windows, [K, W, n, S]
-UNITS = {
-    "m": {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6},
-    "rad": {"rad": 1.0, "mrad": 1e-3, "deg": np.pi / 180},
-    "m/s": {"m/s": 1.0, "mm/s": 1e-3},
-    "rad/s": {"rad/s": 1.0, "deg/s": np.pi / 180},
-    "N or N m": {"N": 1.0, "Nm": 1.0, "mN": 1e-3, "mNm": 1e-3},
+FITTING = {  # unit of a signal -> those that a tolerance may be given in
+    "m": ("m", "cm", "mm", "um"),
+    "rad": ("rad", "mrad", "deg"),
+    "m/s": ("m/s", "mm/s"),
+    "rad/s": ("rad/s", "deg/s"),
+    "N or N m": ("N", "mN", "Nm", "mNm"),
 }
-
-
 SMALL = 0.01  # of a signal's standard deviation: what changes predictions by less may be a trace if nobody says
 
 
@@ -102,13 +101,13 @@ def limits_of(
 
 
 def _in_unit(name: str, value: float | str, unit: str) -> float:
-    known = UNITS.get(unit, {})
+    known = FITTING.get(unit, ())
     match = re.fullmatch(r"([0-9.eE+-]+?)\s*([a-zA-Z/]*)", str(value))
     if match is None or match[2] and match[2] not in known:
         allowed = ", ".join(known) or "a plain number"
         raise UserError(f"--tolerance {name}={value}: no size of this signal. Units that fit: {allowed}.")
     try:
-        number = float(match[1]) * known.get(match[2], 1.0)
+        number = float(match[1]) * UNITS[match[2]]
     except ValueError as error:
         raise _unreadable(f"{name}={value}") from error
     if not (np.isfinite(number) and number > 0):
