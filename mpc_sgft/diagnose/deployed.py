@@ -92,6 +92,8 @@ def diagnose_run(
     if out is not None:
         lowers = repairs(setup, held, verdict.there, hypotheses[0], rng)
         repair.into(out, report.data, held, lowers, lambda: write(deployment, held, out))
+        if report.data["repaired_model"]:
+            report.diff = repair.diff(deployment.task.spec(), out / report.data["repaired_model"])
     report.data["seconds"] = round(time.perf_counter() - began, 2)
     if out is not None:
         report.write(out)

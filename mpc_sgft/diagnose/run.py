@@ -134,7 +134,7 @@ def run(
         lowers = repairs(setup, held, verdict.there, hypotheses[0], rng)
         repair.into(out, report.data, held, lowers, lambda: repair.write(plant, held, out))
         if report.data["repaired_model"]:
-            report.diff = repair.diff(plant, held)
+            report.diff = repair.diff(repair.nominal_spec(plant), out / report.data["repaired_model"])
     report.data["seconds"] = round(time.perf_counter() - began, 2)
     if out is not None:
         report.write(out)

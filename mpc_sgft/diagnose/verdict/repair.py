@@ -16,20 +16,25 @@ from mpc_sgft.diagnose.fitting.hypothesis import Hypothesis
 from mpc_sgft.diagnose.simulation.plant import FORCE, Plant
 
 
-def diff(plant: Plant, held: Hypothesis) -> str:
-    """What the repair changes in the scene, as a unified diff of its MJCF."""
-    nothing = held._replace(fit=held.fit._replace(terms=(), values=()))
-    texts = []
-    for h in (nothing, held):
-        spec, _ = repaired_spec(plant, h)
-        spec.compile()
-        texts.append(spec.to_xml().splitlines())
-    return "\n".join(unified_diff(texts[0], texts[1], fromfile="nominal", tofile="repaired", n=2, lineterm=""))
+def diff(nominal: mujoco.MjSpec, repaired: Path) -> str:
+    """What a repaired scene changes, as a unified diff of MJCF."""
+    nominal.compile()
+    before, after = nominal.to_xml().splitlines(), repaired.read_text().splitlines()
+    return "\n".join(unified_diff(before, after, fromfile="nominal", tofile="repaired", n=2, lineterm=""))
+
+
+def nominal_spec(plant: Plant) -> mujoco.MjSpec:
+    """The scene as it was given."""
+    spec = plant.spec.copy()
+    for sensor in list(spec.sensors):
+        if sensor.name.startswith(FORCE):
+            spec.delete(sensor)
+    return spec
 
 
 def repaired_spec(plant: Plant, best: Hypothesis) -> tuple[mujoco.MjSpec, list[str]]:
     """The scene with refitted quantities and effects in it, and what MJCF cannot carry, in words."""
-    spec, notes = plant.spec.copy(), []
+    spec, notes = nominal_spec(plant), []
     for term, value in zip(best.fit.terms, best.fit.values, strict=True):
         if term.effect == "nominal":
             scale(spec, plant, term.names[0], term.at[0], float(value[0]))
@@ -39,9 +44,6 @@ def repaired_spec(plant: Plant, best: Hypothesis) -> tuple[mujoco.MjSpec, list[s
             effect.edit_spec(spec)
         if not type(effect).native:
             notes.append(f"{term.label}: MJCF has no field for it; use effects.yaml")
-    for sensor in list(spec.sensors):
-        if sensor.name.startswith(FORCE):
-            spec.delete(sensor)
     return spec, notes
 
 
