@@ -14,6 +14,8 @@ import pytest
 
 from mpc_sgft.diagnose import diagnose
 from mpc_sgft.diagnose.page.charts import Chart, ticks
+from mpc_sgft.diagnose.simulation.plant import load_plant
+from mpc_sgft.diagnose.verdict.repair import diff, nominal_spec
 
 PROBE = """<script>
 const box = document.querySelector('svg[data-zoom]').getBoundingClientRect(), y = box.top + box.height / 2;
@@ -89,6 +91,17 @@ def test_the_missing_force_of_dry_friction_is_a_step_and_the_repair_takes_it_awa
         moving = direction * law.speed > 0.2
         assert np.median(law.before[moving]) == pytest.approx(-2.0 * direction, abs=0.4)  # smoothed over 0.3 s
         assert abs(np.median(law.after[moving])) < 0.4
+
+
+def test_a_diff_is_from_the_scene_as_it_was_given(slide: Path, tmp_path: Path) -> None:
+    repaired = tmp_path / "repaired.xml"
+    spec = nominal_spec(load_plant(slide))
+    spec.joint("x").frictionloss = 3.5
+    spec.compile()
+    repaired.write_text(spec.to_xml())
+    lines = diff(nominal_spec(load_plant(slide)), repaired).splitlines()
+    changed = [line for line in lines if line[:1] in "+-" and line[:3] not in ("+++", "---")]
+    assert len(changed) == 2 and 'frictionloss="3.5"' in changed[1] and changed[1][0] == "+"
 
 
 def test_places_on_an_axis() -> None:
