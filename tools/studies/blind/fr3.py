@@ -160,10 +160,11 @@ def simulate(
             command = queue[i]
             k, phase = divmod(i, per_tick)
             if phase == 0 and k < ticks:
-                mujoco.mj_forward(model, data)
-                qs[k], vs[k], force[k] = data.qpos, data.qvel, data.actuator_force
+                qs[k], vs[k] = data.qpos, data.qvel
             if i in sampled:
                 n = sampled[i]
+                mujoco.mj_forward(model, data)
+                force[n] = data.actuator_force
                 clean[n] = data.qpos * one["sensor_gain"] + one["sensor_offset"]
                 speed[n] = data.qvel * one["sensor_gain"]
             friction.step()

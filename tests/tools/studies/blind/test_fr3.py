@@ -111,6 +111,19 @@ def test_a_sensor_that_reads_too_much_shows_what_a_shifted_command_does(sensor: 
     assert np.abs(run().clean - run(**drive).clean).max() > 10 * BEST
 
 
+@pytest.mark.parametrize("steps", [-1, 0, 1])
+def test_a_force_is_read_when_the_encoders_are(steps: int) -> None:
+    ctrl = commands()
+    late = np.full(len(ctrl), steps) * (np.arange(len(ctrl)) > 0)
+    real = fr3.simulate(fr3.reality(XML, PLAIN, fr3.NUMERICS[0]), PLAIN, HOME, np.zeros(7), ctrl, TICK, late)
+    model = mujoco.MjModel.from_xml_string(XML)
+    kp, kv = model.actuator_gainprm[:, 0], -model.actuator_biasprm[:, 2]
+    acting = np.roll(ctrl, 1, 0) if steps < 0 else ctrl  # before its tick, a row's command is not there yet
+    felt = kp * (acting - real.clean) - kv * real.clean_speed
+    assert np.abs(np.diff(ctrl, axis=0) * kp).max() > 1.0
+    assert np.allclose(real.force[1:], felt[1:], atol=1e-6)
+
+
 def test_callbacks_are_removed_whatever_happens() -> None:
     run(ctrl=commands(3))
     assert mujoco.get_mjcb_passive() is None and mujoco.get_mjcb_control() is None
