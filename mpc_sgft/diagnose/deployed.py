@@ -36,7 +36,9 @@ from mpc_sgft.storage.metrics import progress as bar_of
 LENGTH = 6  # control steps in a window
 MOST = 64  # windows
 UNITS = {"observation": "of the observation", "drive": "of the control", "qpos": "rad"}
-EFFORT = Effort(beam=(2,), full=(5, 4, 3), screen_windows=16, quick_windows=16, enough=1.0, pairs=0, exchange=0)
+EFFORT = Effort(
+    beam=(2,), full=(5, 4, 3), screen_windows=16, quick_windows=16, enough=1.0, pairs=0, exchange=0, most=1000
+)
 
 
 def diagnose_run(

@@ -28,6 +28,7 @@ class Effort(NamedTuple):
         enough: Pairs are tried although no effect alone gains, if the error is above this.
         pairs: Of those that the screened effects make, how many get a quick fit.
         exchange: Full fits with one effect of a set that leaves much replaced by another; 0 for no such exchange.
+        most: Effects that are simulated beside those of a set; where there are more, those that promise least are not.
     """
 
     beam: tuple[int, ...] = (2, 1)
@@ -39,6 +40,7 @@ class Effort(NamedTuple):
     enough: float = NOISE + ABOVE_NOISE
     pairs: int = 6
     exchange: int = 4
+    most: int = 30
 
 
 class Proposal(NamedTuple):
@@ -233,6 +235,47 @@ def pair_up(parent: Hypothesis, samples: list[Sample], setup: Setup[Any], effort
                 moved = [v + s * t.size for v, s, t in zip(values, cuts, terms, strict=True)]
                 best[key] = Proposal(terms, tuple(moved), cost)
     return sorted(best.values(), key=lambda p: p.cost)[: effort.pairs]
+
+
+def glance(setup: Setup[Any], parent: Hypothesis, options: list[Option], effort: Effort) -> list[Sample]:
+    """What each option's effect does, without a try of where its Gauss-Newton step leads."""
+    pick = spread(setup.fitted, effort.screen_windows)
+    seen = (preview(setup, parent, o, pick).sample for o in options)
+    return [s for s in seen if s is not None]
+
+
+def worth_a_look(
+    setup: Setup[Any], parent: Hypothesis, options: list[Option], samples: Sequence[Sample], effort: Effort
+) -> list[Option]:
+    """The options whose effects would leave least of a set's residuals if they moved these as they do the nominal ones.
+
+    An arm has as many effects as joints times kinds, and simulating each beside each set takes most of the time. All
+    options where there are few, and those in which an effect becomes a richer one.
+
+    Args:
+        setup: Problem and baseline.
+        parent: The set that they extend.
+        options: As from `proposals`.
+        samples: What each effect does to the nominal model, as from `screen`.
+        effort: How widely.
+    """
+    added = {o.terms[o.new].label for o in options if o.new == len(parent.fit.terms)}
+    if len(added) <= effort.most:
+        return options
+    rows = np.searchsorted(setup.fitted, spread(setup.fitted, effort.screen_windows))
+    r0, J0 = parent.fit.r[rows], parent.fit.J[rows]
+    root = np.sqrt(weights(r0))[:, None, None]
+    left: dict[str, float] = {}
+    for s in samples:
+        if s.term.label in added:
+            J = (np.concatenate([J0, s.J], -1) * root).reshape(r0.size, -1)
+            r = ((r0 + s.moved) * root[..., 0]).ravel()
+            step = np.linalg.lstsq(J, -r, rcond=1e-6)[0]
+            new = slice(J0.shape[-1], None)
+            step[new] = (np.clip(s.start + step[new] * s.term.size, s.term.low, s.term.high) - s.start) / s.term.size
+            left[s.term.label] = min(left.get(s.term.label, np.inf), float(np.sum((r + J @ step) ** 2)))
+    best = set(sorted(left, key=left.__getitem__)[: effort.most])
+    return [o for o in options if o.new < len(parent.fit.terms) or o.terms[o.new].label in best]
 
 
 def _overlap(a: Term, b: Term) -> bool:

@@ -14,9 +14,22 @@ from mpc_sgft.diagnose.fitting import judge
 from mpc_sgft.diagnose.fitting.fit import Fit, fit, robust, typical
 from mpc_sgft.diagnose.fitting.hypothesis import Hypothesis, judge_fit
 from mpc_sgft.diagnose.fitting.prepare import Setup
-from mpc_sgft.diagnose.fitting.screening import Effort, Proposal, key_of, pair_up, proposals, quick_fits, screen, spread
+from mpc_sgft.diagnose.fitting.screening import (
+    Effort,
+    Proposal,
+    Sample,
+    glance,
+    key_of,
+    pair_up,
+    proposals,
+    quick_fits,
+    screen,
+    spread,
+    worth_a_look,
+)
 
 FIRST, NEXT = (1.0, 0.1, 0.01), (0.3,)  # how far from no effect the fits of a first effect start, and of further ones
+GLANCE = (0.1,)  # the same where there are so many effects that most are seen there only
 REJUDGED = 6  # sets that are judged anew, half of them however bad they are
 HOPELESS = 3.0  # times the error of a set, after a few iterations on some windows or of another problem: no full fit
 MUCH = 0.05  # share of the squared error above noise, left of a set: its effects are exchanged for any others
@@ -52,14 +65,19 @@ def search(
     found = {frozenset(): judge_fit(setup, setup.baseline)}
     beam, best, pairs = list(found.values()), found[frozenset()], []
     most, wide = max_effects, 1
+    samples: list[Sample] = []  # what each effect does to the nominal model
     for level in range(max_effects + 1):  # one more, in which simple effects may still be replaced by richer ones
         new: dict[frozenset[str], Hypothesis] = {}
         full = effort.full[min(level, len(effort.full) - 1)] * wide
         for b, parent in enumerate(beam):
             report(f"{' + '.join(parent.names) or 'nominal'}", (level + b / len(beam)) / (max_effects + 1))
             options = proposals(parent, terms, most, FIRST if not level else NEXT)
-            ranked, samples = screen(setup, parent, options, effort.screen_windows)
+            if not level and len({t.label for t in terms}) > effort.most:
+                samples = glance(setup, parent, proposals(parent, terms, most, GLANCE), effort)
+            options = worth_a_look(setup, parent, options, samples, effort)
+            ranked, seen = screen(setup, parent, options, effort.screen_windows)
             if not level:
+                samples = samples or seen
                 pairs = pair_up(parent, samples, setup, effort) if max_effects > 1 and effort.pairs else []
             new |= promising(setup, parent, ranked, full, found | new, effort)
         if level == 1:
@@ -86,7 +104,7 @@ def search(
             beam, most, wide = beam[:1], min(most, PAIR), WIDE
     best = min(found.values(), key=lambda e: e.error)
     if effort.exchange and best.effects > 1 and judge.leaves_much(best.error, found[frozenset()].error, MUCH):
-        found |= exchange(setup, best, found, terms, effort)
+        found |= exchange(setup, best, found, terms, samples, effort)
     return setup, list((found | swaps(setup, found, terms, effort)).values())
 
 
@@ -132,7 +150,12 @@ def promising(
 
 
 def exchange(
-    setup: Setup[Any], best: Hypothesis, found: dict[frozenset[str], Hypothesis], terms: Sequence[Term], effort: Effort
+    setup: Setup[Any],
+    best: Hypothesis,
+    found: dict[frozenset[str], Hypothesis],
+    terms: Sequence[Term],
+    samples: Sequence[Sample],
+    effort: Effort,
 ) -> dict[frozenset[str], Hypothesis]:
     """What becomes of a set that leaves much when one effect makes way for any other, or starts elsewhere.
 
@@ -144,7 +167,8 @@ def exchange(
         less, start = _without(best.fit.terms, i), _without(best.fit.values, i)
         parent = found.get(key_of(setup, less)) or judge_fit(setup, fit(setup.problem, less, start, setup.fitted))
         others = {key: e for key, e in (found | new).items() if key != best.key}
-        ranked, _ = screen(setup, parent, proposals(parent, terms, best.effects, NEXT), effort.screen_windows)
+        options = worth_a_look(setup, parent, proposals(parent, terms, best.effects, NEXT), samples, effort)
+        ranked, _ = screen(setup, parent, options, effort.screen_windows)
         new |= promising(setup, parent, ranked, effort.exchange, others, effort)
     return {key: e for key, e in new.items() if key not in found or e.error < found[key].error}
 

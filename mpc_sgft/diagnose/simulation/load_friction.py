@@ -3,56 +3,73 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import mujoco
 import mujoco.rollout
 import numpy as np
 
-from mpc_sgft.diagnose.data.measured import Array
+from mpc_sgft.diagnose.data.measured import Array, Index
 from mpc_sgft.diagnose.simulation.plant import FORCE, Change, Plant, joint_of
 
 
-class JointActuator(NamedTuple):
-    """An actuator at a joint: what its force becomes when its command changes at once.
+class Drives(NamedTuple):
+    """Actuators at joints: what their forces become when their commands change at once. Arrays of D, one a drive.
 
     Attributes:
-        joint: Index of its joint.
         sensor, ctrl: Where its force and its command are.
         gear, gain: Force of the joint per force of the actuator, and that per command.
-        force, command: Lowest and highest of either.
+        force, command: Lowest and highest of either, [2, D].
+        to_joint: 1 where a drive acts on a joint, [D, nj].
     """
 
-    joint: int
-    sensor: int
-    ctrl: int
-    gear: float
-    gain: float
-    force: tuple[float, float]
-    command: tuple[float, float]
+    sensor: Index
+    ctrl: Index
+    gear: Array
+    gain: Array
+    force: Array
+    command: Array
+    to_joint: Array
 
     @classmethod
-    def of(cls, m: mujoco.MjModel, name: str, joint: int) -> JointActuator:
-        a = m.actuator(name)
-        force = _limits(m.actuator_forcelimited[a.id], m.actuator_forcerange[a.id])
-        command = _limits(m.actuator_ctrllimited[a.id], m.actuator_ctrlrange[a.id])
-        direct = m.actuator_dyntype[a.id] == mujoco.mjtDyn.mjDYN_NONE
-        gain = float(a.gainprm[0]) if direct and m.actuator_gaintype[a.id] == mujoco.mjtGain.mjGAIN_FIXED else 0.0
-        at = int(m.sensor(f"{FORCE}{name}").adr[0])
-        return cls(joint, at, int(a.id), float(a.gear[0]), gain, force, command)
+    def of(cls, plant: Plant, m: mujoco.MjModel, names: Sequence[str] | None = None) -> Drives:
+        """Those of a model, all that are at joints if no names are given."""
+        at = {a: joint_of(plant, a) for a in plant.actuators}
+        names = [a for a in at if at[a]] if names is None else names
+        ids = np.array([m.actuator(a).id for a in names], int)
+        direct = m.actuator_dyntype[ids] == mujoco.mjtDyn.mjDYN_NONE
+        fixed = m.actuator_gaintype[ids] == mujoco.mjtGain.mjGAIN_FIXED
+        return cls(
+            sensor=np.array([m.sensor(f"{FORCE}{a}").adr[0] for a in names], int),
+            ctrl=ids,
+            gear=m.actuator_gear[ids, 0],
+            gain=np.where(direct & fixed, m.actuator_gainprm[ids, 0], 0.0),
+            force=_limits(m.actuator_forcelimited[ids], m.actuator_forcerange[ids]),
+            command=_limits(m.actuator_ctrllimited[ids], m.actuator_ctrlrange[ids]),
+            to_joint=np.array([[float(j == at[a]) for j in plant.joints] for a in names]).reshape(
+                -1, len(plant.joints)
+            ),
+        )
 
     def load(self, felt: Array, then: Array, now: Array) -> Array:
-        """Force on the joint under the command `now`, from what was felt under the command `then`, [...] each.
+        """Forces on the joints under the commands `now`, from what was felt under the commands `then`, [..., D] each.
 
         What is at its limit stays there.
         """
         low, high = self.force
-        change = np.clip(now, *self.command) - np.clip(then, *self.command)
-        return self.gear * np.where((felt <= low) | (felt >= high), felt, np.clip(felt + self.gain * change, low, high))
+        change = _within(now, *self.command) - _within(then, *self.command)
+        moved = _within(felt + self.gain * change, low, high)
+        return self.gear * np.where((felt <= low) | (felt >= high), felt, moved)
 
 
-def _limits(limited: int, given: Array) -> tuple[float, float]:
-    return (float(given[0]), float(given[1])) if limited else (-np.inf, np.inf)
+def _within(x: Array, low: Array, high: Array) -> Array:
+    return np.minimum(np.maximum(x, low), high)
+
+
+def _limits(limited: Array, given: Array) -> Array:
+    """Lowest and highest of each, [2, D]."""
+    return np.where(limited[:, None] > 0, given, [-np.inf, np.inf]).T
 
 
 def roll_with_load_friction(
@@ -81,7 +98,7 @@ def roll_with_load_friction(
     _, vadr = plant.addresses(m)
     losses = [x.dof_frictionloss for x in own]
     before, still = np.array(losses)[:, vadr], np.zeros((len(own), len(vadr)))
-    drives = [JointActuator.of(m, a, plant.joints.index(j)) for a in plant.actuators if (j := joint_of(plant, a))]
+    drives = Drives.of(plant, m)
     states = np.empty((len(own), count, state.shape[1]))
     sensed = np.empty((len(own), count, m.nsensordata))
 
@@ -96,9 +113,7 @@ def roll_with_load_friction(
         states[:, begin:end], sensed[:, begin:end] = out
 
     def set_levels(felt: Array, then: Array, now: Array) -> None:
-        load = still.copy()
-        for d in drives:
-            load[:, d.joint] += d.load(felt[:, d.sensor], then[:, d.ctrl], now[:, d.ctrl])
+        load = drives.load(felt[:, drives.sensor], then[:, drives.ctrl], now[:, drives.ctrl]) @ drives.to_joint
         for k, change in enumerate(changes):
             mine = slice(k * each, (k + 1) * each)
             level = before[mine] + sum((f(load[mine]) for f in change.frictions), still[mine])

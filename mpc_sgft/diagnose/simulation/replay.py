@@ -23,7 +23,7 @@ from mpc_sgft.diagnose.data import windows
 from mpc_sgft.diagnose.data.held_commands import held_mean
 from mpc_sgft.diagnose.data.measured import Array, Episode, Index
 from mpc_sgft.diagnose.data.smooth import smooth
-from mpc_sgft.diagnose.simulation.load_friction import JointActuator, roll_with_load_friction
+from mpc_sgft.diagnose.simulation.load_friction import Drives, roll_with_load_friction
 from mpc_sgft.diagnose.simulation.plant import Change, Plant
 
 FULL = mujoco.mjtState.mjSTATE_FULLPHYSICS
@@ -295,10 +295,11 @@ class Replayer:
         out = {}
         for name in names:
             part = name.split("/", 1)[1]
-            drives = [JointActuator.of(m, part, 0) for m in models]
-            felt, then = _at(sensed[..., drives[0].sensor], at), _at(inputs[..., drives[0].ctrl], at)
+            drives = [Drives.of(self.plant, m, [part]) for m in models]
+            felt, then = _at(sensed[..., drives[0].sensor[0]], at), _at(inputs[..., drives[0].ctrl[0]], at)
             u = now[..., self.plant.actuators.index(part)]
-            out[name] = np.stack([d.load(*rows) for d, *rows in zip(drives, felt, then, u, strict=True)])
+            rows = (x[..., None] for x in (felt, then, u))
+            out[name] = np.stack([d.load(*row)[..., 0] for d, *row in zip(drives, *rows, strict=True)])
         return out
 
     def _read(

@@ -65,6 +65,34 @@ def motion(problem: Lines, limit: float = 0.01, asked: bool = False) -> Toleranc
     return Tolerance(limits, predict, problem.y[..., None], np.ones(1), asked)
 
 
+class Arm(Lines):
+    """Sixty effects, of which three are there; counts how many windows were simulated."""
+
+    def __init__(self) -> None:
+        rng = np.random.default_rng(2)
+        self.columns = {f"e{i}": rng.normal(size=(24, 40)) for i in range(60)}
+        self.y = sum(size * self.columns[f"e{i}"] for i, size in ((7, 3.0), (23, 1.0), (41, 0.5)))
+        self.y = self.y + 0.3 * rng.normal(size=(24, 40))
+        self.simulated = 0
+
+    def residuals(self, terms: Sequence[Term], points: Sequence[Sequence[np.ndarray]], pick: np.ndarray) -> np.ndarray:
+        self.simulated += len(points) * len(pick)
+        return super().residuals(terms, points, pick)
+
+
+def test_of_many_effects_the_right_ones_are_found_with_fewer_simulations() -> None:
+    spent = {}
+    for most in (60, 8):
+        problem, fitted, none = Arm(), np.arange(18), np.zeros(1)
+        base = fit(problem, [], [], fitted)
+        setup = Setup(problem, fitted, np.arange(18, 24), fitted // 3, base, none, none, np.log1p)
+        terms = [term(f"e{i}") for i in range(60)]
+        _, hypotheses = search(setup, terms, 3, np.random.default_rng(0), effort=Effort(most=most))
+        spent[most] = problem.simulated
+        assert set(min(hypotheses, key=lambda e: e.error).names) == {"e7", "e23", "e41"}
+    assert spent[8] < 0.7 * spent[60], spent
+
+
 def found(pairs: int) -> list[set[str]]:
     problem, fitted = Lines(), np.arange(18)
     base = fit(problem, [], [], fitted)

@@ -16,7 +16,7 @@ from mpc_sgft.diagnose.data.measured import Episode
 from mpc_sgft.diagnose.data.smooth import smooth
 from mpc_sgft.diagnose.data.windows import AFTER, BEFORE
 from mpc_sgft.diagnose.fitting.prepare import discrepancy, prepare, typical_sizes
-from mpc_sgft.diagnose.simulation.load_friction import JointActuator
+from mpc_sgft.diagnose.simulation.load_friction import Drives
 from mpc_sgft.diagnose.simulation.plant import Change, Plant
 from mpc_sgft.diagnose.simulation.replay import Replayer, _same_layout
 
@@ -123,9 +123,12 @@ def test_a_force_shows_the_command_that_acts_when_it_is_read(delay: float, off: 
 def test_a_drive_knows_its_limits() -> None:
     general = '<general name="motor" joint="x" gear="2" gainprm="3" forcerange="-6 6" ctrlrange="-5 5"/>'
     scene = SLIDE.replace('<motor name="motor" joint="x"/>', general)
-    drive = JointActuator.of(Plant(mujoco.MjSpec.from_string(scene)).model, "motor", 0)
+    plant = Plant(mujoco.MjSpec.from_string(scene))
+    drive = Drives.of(plant, plant.model)
     felt, then, now = np.array([[3.0, 1.0, 1.2], [6.0, 2.5, 2.4], [3.0, 1.0, 9.0], [1.5, 6.0, 7.0]]).T
-    np.testing.assert_allclose(drive.load(felt, then, now), [2 * 3.6, 2 * 6.0, 2 * 6.0, 2 * 1.5])
+    load = drive.load(*(x[:, None] for x in (felt, then, now)))
+    np.testing.assert_allclose(load, np.array([[2 * 3.6, 2 * 6.0, 2 * 6.0, 2 * 1.5]]).T)
+    np.testing.assert_array_equal(drive.to_joint, [[1.0]])
 
 
 @pytest.fixture
