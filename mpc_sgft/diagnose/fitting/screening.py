@@ -209,32 +209,55 @@ def pair_up(parent: Hypothesis, samples: list[Sample], setup: Setup[Any], effort
     gram = columns.T @ columns
     ends = np.cumsum([p.shape[-1] for p in parts])
     nominal = np.arange(1, ends[1])
-    best: dict[frozenset[str], Proposal] = {}
+    moved = ends[1::2][: len(samples)]  # column of how each effect moves the residuals; its derivatives follow
+    both: dict[tuple[int, int], list[tuple[int, int]]] = {}  # pairs, by their numbers of parameters
     for j, second in enumerate(samples):
         for i, first in enumerate(samples[:j]):
-            if first.term.label == second.term.label or _overlap(first.term, second.term):
-                continue
-            own = [np.arange(ends[2 * k + 2], ends[2 * k + 3]) for k in (i, j)]
-            free = np.concatenate([nominal, *own])
-            fixed = [0, ends[2 * i + 1], ends[2 * j + 1]]  # the nominal residuals, and how either effect moves them
-            A, g = gram[np.ix_(free, free)], gram[np.ix_(free, fixed)].sum(1)
-            step = -np.linalg.solve(A + np.diag(1e-3 * np.diag(A) + 1e-12), g)
-            start, done = list(parent.fit.values), 0
-            for term, value in zip(
-                [*parent.fit.terms, first.term, second.term], [*start, first.start, second.start], strict=True
-            ):
-                size = slice(done, done + len(value))
-                step[size] = (np.clip(value + step[size] * term.size, term.low, term.high) - value) / term.size
-                done += len(value)
-            cost = float(gram[np.ix_(fixed, fixed)].sum() + 2 * g @ step + step @ A @ step)
-            terms = (*parent.fit.terms, first.term, second.term)
-            key = key_of(setup, terms)
-            if key not in best or cost < best[key].cost:
-                values = [*parent.fit.values, first.start, second.start]
-                cuts = np.split(step, np.cumsum([len(v) for v in values])[:-1])
-                moved = [v + s * t.size for v, s, t in zip(values, cuts, terms, strict=True)]
-                best[key] = Proposal(terms, tuple(moved), cost)
-    return sorted(best.values(), key=lambda p: p.cost)[: effort.pairs]
+            if first.term.label != second.term.label and not _overlap(first.term, second.term):
+                both.setdefault((len(first.start), len(second.start)), []).append((i, j))
+    best: dict[frozenset[str], tuple[float, tuple[int, int], Array]] = {}
+    for (p, q), pairs in both.items():
+        i, j = np.array(pairs).T
+        own = [moved[k][:, None] + 1 + np.arange(n) for k, n in ((i, p), (j, q))]
+        free = np.concatenate([np.broadcast_to(nominal, (len(pairs), len(nominal))), *own], 1)
+        fixed = np.stack([np.zeros_like(i), moved[i], moved[j]], 1)
+        starts = [[*parent.fit.values, samples[a].start, samples[b].start] for a, b in pairs]
+        bounds = [[*parent.fit.terms, samples[a].term, samples[b].term] for a, b in pairs]
+        steps, costs = _steps(gram, free, fixed, starts, bounds)
+        for pair, step, cost in zip(pairs, steps, costs, strict=True):
+            key = key_of(setup, (*parent.fit.terms, *(samples[k].term for k in pair)))
+            if key not in best or cost < best[key][0]:
+                best[key] = float(cost), pair, step
+    out = []
+    for cost, pair, step in sorted(best.values(), key=lambda x: x[0])[: effort.pairs]:
+        terms = (*parent.fit.terms, *(samples[k].term for k in pair))
+        values = [*parent.fit.values, *(samples[k].start for k in pair)]
+        cuts = np.split(step, np.cumsum([len(v) for v in values])[:-1])
+        reached = tuple(v + s * t.size for v, s, t in zip(values, cuts, terms, strict=True))
+        out.append(Proposal(terms, reached, cost))
+    return out
+
+
+def _steps(
+    gram: Array, free: Index, fixed: Index, starts: list[list[Array]], terms: list[list[Term]]
+) -> tuple[Array, Array]:
+    """Gauss-Newton steps of many sets within bounds, in typical sizes, and the squares that they leave, [N, P] and [N].
+
+    Args:
+        gram: Products of all columns.
+        free, fixed: Columns of each set that have a step, and those that are as they are, [N, P] and [N, 3].
+        starts, terms: Of each set.
+    """
+    A, g = gram[free[:, :, None], free[:, None]], gram[free[:, :, None], fixed[:, None]].sum(2)
+    ridge = 1e-3 * np.einsum("npp->np", A) + 1e-12
+    step = -np.linalg.solve(A + ridge[:, :, None] * np.eye(free.shape[1]), g[..., None])[..., 0]
+    start, low, high, size = (
+        np.array([np.concatenate(x) for x in rows])
+        for rows in (starts, *([[getattr(t, k) for t in ts] for ts in terms] for k in ("low", "high", "size")))
+    )
+    step = (np.clip(start + step * size, low, high) - start) / size
+    left = gram[fixed[:, :, None], fixed[:, None]].sum((1, 2))
+    return step, left + 2 * np.einsum("np,np->n", g, step) + np.einsum("np,npq,nq->n", step, A, step)
 
 
 def glance(setup: Setup[Any], parent: Hypothesis, options: list[Option], effort: Effort) -> list[Sample]:
