@@ -1,11 +1,13 @@
 """How long diagnose takes, by seconds of data and by candidates, and on a deployment.
 
     python -m tools.benchmarks.time_diagnose [--out results/timing/time_diagnose.csv] [--run runs/push/latest] [--quick]
+                                             [--case CASE...]
 
 A pendulum with hidden friction is simulated finely and diagnosed, with 4 to 32 s of data and the whole library but for
 contacts, and with 8 s of data and part of the library. `per` is the time by the seconds of data, or by the candidates,
 relative to the smallest row of the same kind, measured in the same process: 1 means that the cost is proportional,
-less that it grows slower.
+less that it grows slower. A case is a folder with model.xml and episodes, such as one of the FR3 that
+`tools.studies.blind_benchmark --fr3 1 --only generate` makes.
 """
 
 import argparse
@@ -25,6 +27,8 @@ from mpc_sgft.diagnose.candidates.effect_facts import effect_class
 from mpc_sgft.diagnose.candidates.effect_table import TABLE
 from mpc_sgft.diagnose.data.measured import write_csv
 from mpc_sgft.diagnose.deployed import diagnose_run
+from mpc_sgft.diagnose.run import read
+from mpc_sgft.diagnose.simulation.plant import load_plant
 
 PENDULUM = """<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody><body>
 <joint name="hinge" axis="0 1 0" damping="0.02"/><geom type="capsule" size="0.02" fromto="0 0 0 0 0 -0.5" mass="0.6"/>
@@ -71,6 +75,20 @@ def measure(folder: Path, seconds: float, names: list[str], kind: str) -> dict[s
     }
 
 
+def measure_case(case: Path) -> dict[str, Any]:
+    """One row of a folder with a model and episodes."""
+    began, busy, files = time.perf_counter(), time.process_time(), sorted(case.glob("*.csv"))
+    report = diagnose(case / "model.xml", files).as_dict()
+    joints = mujoco.MjModel.from_xml_path(str(case / "model.xml")).njnt
+    return {
+        "what": f"{joints} joints",
+        "seconds_of_data": round(float(sum(e.seconds for e in read(load_plant(case / "model.xml"), files))), 1),
+        "said": " ".join([report["verdict"], *(e["name"] for e in report["effects"])]),
+        "wall_s": round(time.perf_counter() - began, 1),
+        "cpu_s": round(time.process_time() - busy, 1),
+    }
+
+
 def measure_run(run: Path) -> dict[str, Any]:
     """One row of a deployment."""
     began, busy = time.perf_counter(), time.process_time()
@@ -87,6 +105,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("results/timing/time_diagnose.csv"))
     parser.add_argument("--run", type=Path, help="run folder of a deployment")
+    parser.add_argument("--case", type=Path, nargs="+", default=[], help="folders with model.xml and episodes")
     parser.add_argument("--quick", action="store_true", help="the smallest of each only")
     args = parser.parse_args()
     durations, parts = (DURATIONS[:1], PARTS[:1]) if args.quick else (DURATIONS, PARTS)
@@ -101,6 +120,9 @@ def main() -> None:
             rows.append(measure(Path(folder), 8.0, NAMES[:count], "candidates"))
             rows[-1]["per"] = round(rows[-1]["cpu_s"] / rows[first]["cpu_s"] * parts[0] / count, 2)
             print(rows[-1], flush=True)
+    for case in args.case:
+        rows.append(measure_case(case))
+        print(rows[-1], flush=True)
     if args.run:
         rows.append(measure_run(args.run))
         print(rows[-1], flush=True)
