@@ -18,7 +18,13 @@ def parser() -> argparse.ArgumentParser:
         allow_abbrev=False,
     )
     p.add_argument("--model", type=Path, metavar="XML", help="nominal MJCF scene")
-    p.add_argument("--data", type=Path, nargs="+", metavar="PATH", help="episodes: CSV, Parquet or MCAP files, folders")
+    p.add_argument(
+        "--data",
+        type=Path,
+        nargs="+",
+        metavar="PATH",
+        help="episodes: CSV, Parquet or MCAP files, LeRobotDataset folders, folders of these",
+    )
     p.add_argument(
         "--out", type=Path, metavar="DIR", help="where the report goes; default diagnosis/, or RUN/diagnosis"
     )

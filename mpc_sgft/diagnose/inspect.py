@@ -11,8 +11,10 @@ import numpy as np
 from mpc_sgft.command.errors import UserError
 from mpc_sgft.diagnose.data.check import GAP, episodes
 from mpc_sgft.diagnose.data.mapping import Source, mapped
-from mpc_sgft.diagnose.data.measured import Array, Table, files, read_table
+from mpc_sgft.diagnose.data.matching import matched
+from mpc_sgft.diagnose.data.measured import Array, Table
 from mpc_sgft.diagnose.data.smooth import noise_of
+from mpc_sgft.diagnose.data.sources import describe, sources, tables
 from mpc_sgft.diagnose.simulation.plant import Plant
 
 ENOUGH = 100.0  # times the noise that a position must move for small effects to show
@@ -31,10 +33,20 @@ def inspect(data: Sequence[str | Path], plant: Plant | None = None, mapping: Map
     Raises:
         UserError: If a file is not there or cannot be read at all.
     """
-    return "\n\n".join(_file(mapped(read_table(path), mapping or {}), plant) for path in files(data))
+    parts: list[str] = []
+    for path in sources(data):
+        parts += [words] if (words := describe(path)) else []
+        parts += [_table(mapped(table, mapping or {}), plant) for table in tables(path)]
+    return "\n\n".join(parts)
 
 
-def _file(table: Table, plant: Plant | None) -> str:
+def _table(table: Table, plant: Plant | None) -> str:
+    stop = ""
+    if plant is not None:
+        try:
+            table = matched(table, plant.machine())
+        except UserError as error:
+            stop = str(error)
     columns = table.columns
     lines = [_clock(table)]
     if table.lost:
@@ -42,7 +54,9 @@ def _file(table: Table, plant: Plant | None) -> str:
     width = max(map(len, columns))
     lines += [f"  {name:<{width}}  {_means(name, plant):<12} {_range(name, x)}" for name, x in columns.items()]
     lines += [f"  {line}" for line in _missing(table, plant)]
-    if plant is not None:
+    if stop:
+        lines.append(f"  diagnose would stop: {stop}")
+    elif plant is not None:
         try:
             found = episodes(table, plant.actuators, plant.axes(), plant.servos())
         except UserError as error:

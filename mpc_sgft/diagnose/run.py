@@ -15,8 +15,9 @@ from mpc_sgft.command.errors import UserError
 from mpc_sgft.diagnose.candidates.library import Term, candidates
 from mpc_sgft.diagnose.candidates.nominal import nominal_terms, refit_table
 from mpc_sgft.diagnose.data.check import check_settings, episodes
-from mpc_sgft.diagnose.data.mapping import Source, mapped
-from mpc_sgft.diagnose.data.measured import Array, Episode, files, read_table
+from mpc_sgft.diagnose.data.mapping import Source
+from mpc_sgft.diagnose.data.measured import Array, Episode
+from mpc_sgft.diagnose.data.sources import named, sources, tables
 from mpc_sgft.diagnose.fitting import judge
 from mpc_sgft.diagnose.fitting.fit import Fit, Problem, change_of
 from mpc_sgft.diagnose.fitting.hypothesis import Hypothesis
@@ -54,11 +55,12 @@ def read(plant: Plant, data: Sequence[str | Path], mapping: Mapping[str, Source]
     Raises:
         UserError: If they are not usable or do not share a sample time.
     """
-    axes, servos = plant.axes(), plant.servos()
+    axes, servos, machine = plant.axes(), plant.servos(), plant.machine()
     found = [
         e
-        for path in files(data)
-        for e in episodes(mapped(read_table(path), mapping or {}), plant.actuators, axes, servos)
+        for path in sources(data)
+        for table in tables(path)
+        for e in episodes(named(table, mapping or {}, machine), plant.actuators, axes, servos)
     ]
     steps = [e.dt for e in found]
     if max(steps) > 1.05 * min(steps):

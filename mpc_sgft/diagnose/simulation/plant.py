@@ -12,6 +12,7 @@ import numpy as np
 
 from envs.effects.passive import stiffen_dry_friction
 from mpc_sgft.command.errors import UserError
+from mpc_sgft.diagnose.data.matching import Drive, Machine
 from mpc_sgft.diagnose.data.measured import Array, Index
 from mpc_sgft.diagnose.data.units import Axis
 
@@ -124,6 +125,15 @@ class Plant:
         m = self.model
         found = {a: joint_of(self, a) for i, a in enumerate(self.actuators) if m.actuator_biasprm[i, 1] < 0}
         return {a: j for a, j in found.items() if j and m.actuator(a).gear[0] > 0}
+
+    def machine(self) -> Machine:
+        """The names that a recording is matched with."""
+        m = self.model
+        asks = [
+            "position" if bias[1] < 0 else "velocity" if bias[2] < 0 else "effort"
+            for bias in m.actuator_biasprm[: m.nu]
+        ]
+        return Machine(self.joints, {a: Drive(joint_of(self, a), q) for a, q in zip(self.actuators, asks, strict=True)})
 
     def sensors(self) -> list[str]:
         """Sensors of the scene itself that give one number."""
