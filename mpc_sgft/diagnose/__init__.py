@@ -47,7 +47,7 @@ def diagnose(
 
     Args:
         model: MJCF file, spec, or the model that was compiled last.
-        data: Episode files (CSV, Parquet, MCAP), LeRobotDataset folders, and folders of these.
+        data: Episode files (CSV, Parquet, MCAP), ROS 2 bags, LeRobotDataset folders, and folders of these.
         out: Folder for report.json, report.html, report.rrd, and where the error on windows that were never fitted
             credibly falls, repaired.xml and effects.yaml; nothing is written if None.
         effects: Names of the only effects to consider; all that the data can show if None.

@@ -23,7 +23,7 @@ def parser() -> argparse.ArgumentParser:
         type=Path,
         nargs="+",
         metavar="PATH",
-        help="episodes: CSV, Parquet or MCAP files, LeRobotDataset folders, folders of these",
+        help="episodes: CSV, Parquet or MCAP files, ROS 2 bags, LeRobotDataset folders, folders of these",
     )
     p.add_argument(
         "--out", type=Path, metavar="DIR", help="where the report goes; default diagnosis/, or RUN/diagnosis"

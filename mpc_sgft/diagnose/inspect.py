@@ -10,11 +10,10 @@ import numpy as np
 
 from mpc_sgft.command.errors import UserError
 from mpc_sgft.diagnose.data.check import GAP, episodes
-from mpc_sgft.diagnose.data.mapping import Source, mapped
-from mpc_sgft.diagnose.data.matching import matched
+from mpc_sgft.diagnose.data.mapping import Source
 from mpc_sgft.diagnose.data.measured import Array, Table
 from mpc_sgft.diagnose.data.smooth import noise_of
-from mpc_sgft.diagnose.data.sources import describe, sources, tables
+from mpc_sgft.diagnose.data.sources import named, opened, sources, tables
 from mpc_sgft.diagnose.simulation.plant import Plant
 
 ENOUGH = 100.0  # times the noise that a position must move for small effects to show
@@ -35,8 +34,16 @@ def inspect(data: Sequence[str | Path], plant: Plant | None = None, mapping: Map
     """
     parts: list[str] = []
     for path in sources(data):
-        parts += [words] if (words := describe(path)) else []
-        parts += [_table(mapped(table, mapping or {}), plant) for table in tables(path)]
+        recording = opened(path)
+        parts += [recording.words] if recording.words else []
+        try:
+            found = tables(recording, mapping or {}, None if plant is None else plant.machine())
+        except UserError as error:
+            if not recording.words:
+                raise
+            parts.append(f"  diagnose would stop: {error}")
+        else:
+            parts += [_table(table, plant) for table in found]
     return "\n\n".join(parts)
 
 
@@ -44,7 +51,7 @@ def _table(table: Table, plant: Plant | None) -> str:
     stop = ""
     if plant is not None:
         try:
-            table = matched(table, plant.machine())
+            table = named(table, plant.machine())
         except UserError as error:
             stop = str(error)
     columns = table.columns

@@ -17,7 +17,7 @@ from mpc_sgft.diagnose.candidates.nominal import nominal_terms, refit_table
 from mpc_sgft.diagnose.data.check import check_settings, episodes
 from mpc_sgft.diagnose.data.mapping import Source
 from mpc_sgft.diagnose.data.measured import Array, Episode
-from mpc_sgft.diagnose.data.sources import named, sources, tables
+from mpc_sgft.diagnose.data.sources import named, opened, sources, tables
 from mpc_sgft.diagnose.fitting import judge
 from mpc_sgft.diagnose.fitting.fit import Fit, Problem, change_of
 from mpc_sgft.diagnose.fitting.hypothesis import Hypothesis
@@ -59,8 +59,8 @@ def read(plant: Plant, data: Sequence[str | Path], mapping: Mapping[str, Source]
     found = [
         e
         for path in sources(data)
-        for table in tables(path)
-        for e in episodes(named(table, mapping or {}, machine), plant.actuators, axes, servos)
+        for table in tables(opened(path), mapping or {}, machine)
+        for e in episodes(named(table, machine), plant.actuators, axes, servos)
     ]
     steps = [e.dt for e in found]
     if max(steps) > 1.05 * min(steps):

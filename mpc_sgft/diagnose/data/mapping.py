@@ -117,7 +117,8 @@ def mapped(table: Table, mapping: Mapping[str, Source]) -> Table:
     left = {n: x for n, x in has.items() if n not in used and n not in mapping}
     made = {name: s.factor * has[s.column] + s.offset for name, s in mapping.items()}
     offers = tuple(offer for offer in table.offers if offer.column not in used)
-    return replace(table, columns=left | made, offers=offers)
+    held = tuple(n for n in table.held if n in left) + tuple(n for n, s in mapping.items() if s.column in table.held)
+    return replace(table, columns=left | made, offers=offers, held=held)
 
 
 def _from_file(path: Path) -> dict[str, str]:

@@ -74,8 +74,8 @@ def _wanted(table: Table, machine: Machine) -> dict[str, list[Offer]]:
     for name, drive in machine.drives.items():
         named = [o for o in commands if o.joint and o.joint in (name, drive.joint)]
         out[f"ctrl/{name}"] = [o for o in named if o.quantity in ("", drive.quantity)]
-        if len(machine.drives) == 1 and len(commands) == 1 and not commands[0].joint:
-            out[f"ctrl/{name}"] = commands
+        if len(machine.drives) == 1 and len(commands) == 1 and not commands[0].joint:  # one that names none
+            out[f"ctrl/{name}"] = [o for o in commands if o.quantity in ("", drive.quantity)]
     if machine.open and not machine.drives and not any(name.startswith("ctrl/") for name in table.columns):
         out |= {f"ctrl/{j}": [o for o in commands if (o.joint, o.quantity) == (j, "effort")] for j in machine.joints}
         asked = [o for o in commands if o.joint in machine.joints]

@@ -49,6 +49,7 @@ class Table:
         lost: What was lost of it, None if nothing.
         notes: What was decided while reading, in words.
         offers: Columns that may be ours under another name.
+        held: Columns that were read on another clock than their own: nan where they had not begun yet.
     """
 
     name: str
@@ -56,6 +57,7 @@ class Table:
     lost: str | None = None
     notes: tuple[str, ...] = ()
     offers: tuple[Offer, ...] = ()
+    held: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

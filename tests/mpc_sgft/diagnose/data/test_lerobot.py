@@ -16,7 +16,7 @@ from mpc_sgft.diagnose.__main__ import main
 from mpc_sgft.diagnose.data.lerobot import names_of, read_dataset
 from mpc_sgft.diagnose.data.matching import Drive, Machine, matched
 from mpc_sgft.diagnose.data.measured import Table, write_csv
-from mpc_sgft.diagnose.data.sources import sources, tables
+from mpc_sgft.diagnose.data.sources import opened, sources, tables
 
 LENGTHS = (80, 60, 70)
 PATHS = {
@@ -88,7 +88,7 @@ def test_each_episode_is_a_table_of_named_columns(version: int, tmp_path: Path) 
     told = [numbers(n, seed) for seed, n in enumerate(LENGTHS)]
     write_dataset(tmp_path / "pick", told, version=version)
     assert sources([tmp_path]) == sources([tmp_path / "pick"]) == [tmp_path / "pick"]
-    found = tables(tmp_path / "pick")
+    found = tables(opened(tmp_path / "pick"), {}, None)
     assert [t.name for t in found] == ["pick-000000", "pick-000001", "pick-000002"]
     for table, truth in zip(found, told, strict=True):
         np.testing.assert_array_equal(table.columns["time"], np.arange(len(truth["action"])) / 50)
