@@ -17,7 +17,7 @@ def parser() -> argparse.ArgumentParser:
         description="Find where simulation and measurement disagree, name the missing effect, repair the model.",
         allow_abbrev=False,
     )
-    p.add_argument("--model", type=Path, metavar="XML", help="nominal MJCF scene")
+    p.add_argument("--model", type=Path, metavar="XML", help="nominal scene: MJCF, or URDF")
     p.add_argument(
         "--data",
         type=Path,

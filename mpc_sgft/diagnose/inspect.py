@@ -14,7 +14,7 @@ from mpc_sgft.diagnose.data.mapping import Source
 from mpc_sgft.diagnose.data.measured import Array, Table
 from mpc_sgft.diagnose.data.smooth import noise_of
 from mpc_sgft.diagnose.data.sources import named, opened, sources, tables
-from mpc_sgft.diagnose.simulation.plant import Plant
+from mpc_sgft.diagnose.simulation.plant import Plant, driven
 
 ENOUGH = 100.0  # times the noise that a position must move for small effects to show
 FEW = 4  # reversals, below which friction and play hardly show
@@ -52,6 +52,7 @@ def _table(table: Table, plant: Plant | None) -> str:
     if plant is not None:
         try:
             table = named(table, plant.machine())
+            plant = driven(plant, [table])
         except UserError as error:
             stop = str(error)
     columns = table.columns
@@ -71,6 +72,7 @@ def _table(table: Table, plant: Plant | None) -> str:
         else:
             pieces = f" in {len(found)} pieces" if len(found) > 1 else ""
             lines.append(f"  diagnose can use it{pieces}")
+            lines += [f"  note: {note}" for note in plant.notes]
             lines += [f"  note: {note.removeprefix(f'{table.name}: ')}" for e in found for note in e.notes]
     return "\n".join(lines)
 

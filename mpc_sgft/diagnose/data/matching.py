@@ -25,12 +25,12 @@ class Machine(NamedTuple):
     Attributes:
         joints: Of the model.
         drives: Actuator -> what it drives.
-        open: Whether the model says nothing of actuators, so that recorded efforts get motors (a URDF).
+        bare: Whether the model cannot name actuators, so that recorded efforts get motors (a URDF).
     """
 
     joints: Sequence[str]
     drives: Mapping[str, Drive]
-    open: bool = False
+    bare: bool = False
 
 
 def matched(table: Table, machine: Machine) -> Table:
@@ -76,15 +76,24 @@ def _wanted(table: Table, machine: Machine) -> dict[str, list[Offer]]:
         out[f"ctrl/{name}"] = [o for o in named if o.quantity in ("", drive.quantity)]
         if len(machine.drives) == 1 and len(commands) == 1 and not commands[0].joint:  # one that names none
             out[f"ctrl/{name}"] = [o for o in commands if o.quantity in ("", drive.quantity)]
-    if machine.open and not machine.drives and not any(name.startswith("ctrl/") for name in table.columns):
-        out |= {f"ctrl/{j}": [o for o in commands if (o.joint, o.quantity) == (j, "effort")] for j in machine.joints}
-        asked = [o for o in commands if o.joint in machine.joints]
-        if asked and not any(o.quantity == "effort" for o in asked):
-            raise UserError(
-                f"{table.name}: it holds commands that are no efforts ({asked[0].column}), and a URDF says nothing of "
-                "the servos behind them. Give an MJCF scene with the servos, or record efforts."
-            )
+    if machine.bare and commands and not any(name.startswith("ctrl/") for name in table.columns):
+        out |= _efforts(table, machine, commands)
     return {name: fits for name, fits in out.items() if name not in table.columns}
+
+
+def _efforts(table: Table, machine: Machine, commands: list[Offer]) -> dict[str, list[Offer]]:
+    """Commands that are efforts of joints by name, for a model that names no actuators."""
+    efforts = [o for o in commands if o.quantity == "effort"]
+    out = {f"ctrl/{j}": fits for j in machine.joints if (fits := [o for o in efforts if o.joint == j])}
+    if not out and len(machine.joints) == len(commands) == len(efforts) == 1 and not efforts[0].joint:
+        out = {f"ctrl/{machine.joints[0]}": efforts}
+    if not out:
+        raise UserError(
+            f"{table.name}: it holds commands ({', '.join(o.column for o in commands)}), none of which is by its name "
+            "the effort of a joint, and a URDF knows no servos. Give an MJCF scene with the servos, or say which are "
+            f"efforts: --map 'ctrl/{machine.joints[0]}={commands[0].column}'."
+        )
+    return out
 
 
 def _hint(table: Table, machine: Machine, missing: list[str]) -> str:
@@ -92,10 +101,18 @@ def _hint(table: Table, machine: Machine, missing: list[str]) -> str:
     said = []
     for name in missing:
         kind, _, part = name.partition("/")
-        offered = {o.joint: o.column for o in table.offers if o.kind == kind}
+        asks = ("", machine.drives[part].quantity if kind == "ctrl" else "position")
+        offered = {o.joint: o.column for o in table.offers if o.kind == kind and o.quantity in asks}
         near = get_close_matches(part, offered, 1, 0.5)
         said.append(f"{name}={offered[near[0]] if near else 'COLUMN'}")
+    wrong = [d.quantity for a, d in machine.drives.items() if f"ctrl/{a}" in missing]
+    told = {o.quantity for o in table.offers if o.kind == "ctrl"} - {""}
+    else_ = (
+        f"; the model's actuators take {wrong[0]}, the recording commands {' and '.join(sorted(told))}"
+        if wrong and told
+        else ""
+    )
     return (
         f"{table.name}: nothing is called as in the model: {', '.join(missing)}. Say what they are: --map "
-        f"'{','.join(said)}' (a unit may follow: deg). It has: {', '.join(o.column for o in table.offers)}."
+        f"'{','.join(said)}' (a unit may follow: deg){else_}. It has: {', '.join(o.column for o in table.offers)}."
     )
