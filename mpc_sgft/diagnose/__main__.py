@@ -127,9 +127,17 @@ def _run(args: argparse.Namespace) -> int:
 
 
 def _inspect(args: argparse.Namespace) -> int:
+    from mpc_sgft.command.errors import UserError
     from mpc_sgft.diagnose.inspect import inspect
     from mpc_sgft.diagnose.simulation.plant import load_plant
 
+    alone = parser().parse_args([])
+    given = [name for name in vars(alone) if getattr(args, name) != getattr(alone, name)]
+    if others := sorted({*given} - {"inspect", "model", "map"}):
+        raise UserError(
+            f"--{others[0].replace('_', '-')} does not go with --inspect, which only looks: --inspect RECORDINGS, with "
+            "--model and --map if you like."
+        )
     print(inspect(args.inspect, None if args.model is None else load_plant(args.model), _mapping(args.map)))
     return 0
 

@@ -82,7 +82,10 @@ def test_meshes_are_found_in_their_package_or_left_out(tmp_path: Path) -> None:
     assert plant.model.nmesh == plant.model.ngeom == 1
     (note,) = plant.notes
     assert "package://gone/arm.stl, package://my_robot/meshes/arm.dae" in note and "skin" not in note
-    parts[1] = link("arm", 1.0, MESH.format("collision", "../meshes/arm.obj"))
+    (package / "meshes").rename(tmp_path / "shapes")
+    parts[1] = link("arm", 1.0, MESH.format("collision", "package://shapes/arm.obj"))  # a package beside its own
+    assert load_plant(write_urdf(package / "urdf" / "r.urdf", *parts)).model.nmesh == 1
+    parts[1] = link("arm", 1.0, MESH.format("collision", "../../shapes/arm.obj"))
     assert load_plant(write_urdf(package / "urdf" / "r.urdf", *parts)).model.nmesh == 1
 
 
@@ -142,7 +145,7 @@ def test_commands_by_name_are_efforts_or_asked_about(tmp_path: Path) -> None:
 def test_a_hidden_friction_is_found(motor: bool, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     """A pendulum of 1 kg, 0.2 m below its joint, I = 0.02 + 0.04 kg m^2, by equations of our own."""
     path, rng, drag = write_urdf(tmp_path / "r.urdf", *PENDULUM), np.random.default_rng(0), 0.03
-    for k, angle in enumerate((0.5, 0.9, -0.7)):
+    for k, angle in enumerate((0.9, -0.7)):
         q, v, h, rows = angle, 0.0, 1e-4, []
         command = 0.0
         for step in range(30_000):
@@ -154,7 +157,8 @@ def test_a_hidden_friction_is_found(motor: bool, tmp_path: Path, capsys: pytest.
             q += h * v
         time, seen, told = np.array(rows).T
         columns = {"time": time, "qpos/swing": seen} | ({"ctrl/swing": told} if motor else {})
-        write_csv(tmp_path / "data" / f"{k}.csv", columns) if k else (tmp_path / "data").mkdir()
+        (tmp_path / "data").mkdir(exist_ok=True)
+        write_csv(tmp_path / "data" / f"{k}.csv", columns)
     out, few = tmp_path / "out", "viscous_friction,coulomb_friction,payload"
     assert main(["--inspect", str(tmp_path / "data"), "--model", str(path)]) == 0
     assert "diagnose can use it" in capsys.readouterr().out
