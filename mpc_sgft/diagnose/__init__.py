@@ -46,8 +46,9 @@ def diagnose(
     """Compare a model with measurements and say what it lacks.
 
     Args:
-        model: MJCF file, spec, or the model that was compiled last.
-        data: Episode files (CSV, Parquet, MCAP) and folders of them.
+        model: MJCF or URDF file, spec, or the model that was compiled last. A URDF has no actuators: joints whose
+            efforts were recorded as `ctrl/<joint>` get motors.
+        data: Episode files (CSV, Parquet, MCAP), ROS 2 bags, LeRobotDataset folders, and folders of these.
         out: Folder for report.json, report.html, report.rrd, and where the error on windows that were never fitted
             credibly falls, repaired.xml and effects.yaml; nothing is written if None.
         effects: Names of the only effects to consider; all that the data can show if None.
@@ -73,10 +74,10 @@ def diagnose(
     from mpc_sgft.diagnose.run import read, run
     from mpc_sgft.diagnose.simulation.plant import load_plant
 
-    plant = load_plant(model)
+    plant, recorded = read(load_plant(model), data, parse_mapping(mapping or {}))
     return run(
         plant,
-        read(plant, data, parse_mapping(mapping or {})),
+        recorded,
         out=out,
         effects=effects,
         signals=signals,

@@ -17,8 +17,14 @@ def parser() -> argparse.ArgumentParser:
         description="Find where simulation and measurement disagree, name the missing effect, repair the model.",
         allow_abbrev=False,
     )
-    p.add_argument("--model", type=Path, metavar="XML", help="nominal MJCF scene")
-    p.add_argument("--data", type=Path, nargs="+", metavar="PATH", help="episodes: CSV, Parquet or MCAP files, folders")
+    p.add_argument("--model", type=Path, metavar="XML", help="nominal scene: MJCF, or URDF")
+    p.add_argument(
+        "--data",
+        type=Path,
+        nargs="+",
+        metavar="PATH",
+        help="episodes: CSV, Parquet or MCAP files, ROS 2 bags, LeRobotDataset folders, folders of these",
+    )
     p.add_argument(
         "--out", type=Path, metavar="DIR", help="where the report goes; default diagnosis/, or RUN/diagnosis"
     )
@@ -121,9 +127,17 @@ def _run(args: argparse.Namespace) -> int:
 
 
 def _inspect(args: argparse.Namespace) -> int:
+    from mpc_sgft.command.errors import UserError
     from mpc_sgft.diagnose.inspect import inspect
     from mpc_sgft.diagnose.simulation.plant import load_plant
 
+    alone = parser().parse_args([])
+    given = [name for name in vars(alone) if getattr(args, name) != getattr(alone, name)]
+    if others := sorted({*given} - {"inspect", "model", "map"}):
+        raise UserError(
+            f"--{others[0].replace('_', '-')} does not go with --inspect, which only looks: --inspect RECORDINGS, with "
+            "--model and --map if you like."
+        )
     print(inspect(args.inspect, None if args.model is None else load_plant(args.model), _mapping(args.map)))
     return 0
 

@@ -10,10 +10,11 @@ import numpy as np
 
 from mpc_sgft.command.errors import UserError
 from mpc_sgft.diagnose.data.check import GAP, episodes
-from mpc_sgft.diagnose.data.mapping import Source, mapped
-from mpc_sgft.diagnose.data.measured import Array, Table, files, read_table
+from mpc_sgft.diagnose.data.mapping import Source
+from mpc_sgft.diagnose.data.measured import Array, Table
 from mpc_sgft.diagnose.data.smooth import noise_of
-from mpc_sgft.diagnose.simulation.plant import Plant
+from mpc_sgft.diagnose.data.sources import named, opened, sources, tables
+from mpc_sgft.diagnose.simulation.plant import Plant, driven
 
 ENOUGH = 100.0  # times the noise that a position must move for small effects to show
 FEW = 4  # reversals, below which friction and play hardly show
@@ -31,10 +32,29 @@ def inspect(data: Sequence[str | Path], plant: Plant | None = None, mapping: Map
     Raises:
         UserError: If a file is not there or cannot be read at all.
     """
-    return "\n\n".join(_file(mapped(read_table(path), mapping or {}), plant) for path in files(data))
+    parts: list[str] = []
+    for path in sources(data):
+        recording = opened(path)
+        parts += [recording.words] if recording.words else []
+        try:
+            found = tables(recording, mapping or {}, None if plant is None else plant.machine())
+        except UserError as error:
+            if not recording.words:
+                raise
+            parts.append(f"  diagnose would stop: {error}")
+        else:
+            parts += [_table(table, plant) for table in found]
+    return "\n\n".join(parts)
 
 
-def _file(table: Table, plant: Plant | None) -> str:
+def _table(table: Table, plant: Plant | None) -> str:
+    stop = ""
+    if plant is not None:
+        try:
+            table = named(table, plant.machine())
+            plant = driven(plant, [table])
+        except UserError as error:
+            stop = str(error)
     columns = table.columns
     lines = [_clock(table)]
     if table.lost:
@@ -42,7 +62,9 @@ def _file(table: Table, plant: Plant | None) -> str:
     width = max(map(len, columns))
     lines += [f"  {name:<{width}}  {_means(name, plant):<12} {_range(name, x)}" for name, x in columns.items()]
     lines += [f"  {line}" for line in _missing(table, plant)]
-    if plant is not None:
+    if stop:
+        lines.append(f"  diagnose would stop: {stop}")
+    elif plant is not None:
         try:
             found = episodes(table, plant.actuators, plant.axes(), plant.servos())
         except UserError as error:
@@ -50,6 +72,7 @@ def _file(table: Table, plant: Plant | None) -> str:
         else:
             pieces = f" in {len(found)} pieces" if len(found) > 1 else ""
             lines.append(f"  diagnose can use it{pieces}")
+            lines += [f"  note: {note}" for note in plant.notes]
             lines += [f"  note: {note.removeprefix(f'{table.name}: ')}" for e in found for note in e.notes]
     return "\n".join(lines)
 

@@ -15,8 +15,9 @@ from mpc_sgft.command.errors import UserError
 from mpc_sgft.diagnose.candidates.library import Term, candidates
 from mpc_sgft.diagnose.candidates.nominal import nominal_terms, refit_table
 from mpc_sgft.diagnose.data.check import check_settings, episodes
-from mpc_sgft.diagnose.data.mapping import Source, mapped
-from mpc_sgft.diagnose.data.measured import Array, Episode, files, read_table
+from mpc_sgft.diagnose.data.mapping import Source
+from mpc_sgft.diagnose.data.measured import Array, Episode
+from mpc_sgft.diagnose.data.sources import named, opened, sources, tables
 from mpc_sgft.diagnose.fitting import judge
 from mpc_sgft.diagnose.fitting.fit import Fit, Problem, change_of
 from mpc_sgft.diagnose.fitting.hypothesis import Hypothesis
@@ -27,7 +28,7 @@ from mpc_sgft.diagnose.fitting.search import nearest, refit, search
 from mpc_sgft.diagnose.page.laws import laws
 from mpc_sgft.diagnose.report import Report
 from mpc_sgft.diagnose.rows import Shown, candidate_rows, effect_rows, reduction, trace_rows, waterfall
-from mpc_sgft.diagnose.simulation.plant import SHARP, Change, Plant, joint_of
+from mpc_sgft.diagnose.simulation.plant import SHARP, Change, Plant, driven, joint_of
 from mpc_sgft.diagnose.simulation.replay import Replayer
 from mpc_sgft.diagnose.verdict import repair
 from mpc_sgft.diagnose.verdict.locate import locate
@@ -43,8 +44,10 @@ STEPS = (4 * SHARP, 2 * SHARP, SHARP)  # [s] to simulate with: the longest whose
 UNSEEN, NOTHING = 0.2, 0.1  # share of the expected squared error that noise hides in a search, and in a judgement
 
 
-def read(plant: Plant, data: Sequence[str | Path], mapping: Mapping[str, Source] | None = None) -> list[Episode]:
-    """All episodes of the files, on one clock.
+def read(
+    plant: Plant, data: Sequence[str | Path], mapping: Mapping[str, Source] | None = None
+) -> tuple[Plant, list[Episode]]:
+    """All episodes of the files, on one clock, and the model with the motors that they need.
 
     Args:
         plant: The model.
@@ -54,18 +57,19 @@ def read(plant: Plant, data: Sequence[str | Path], mapping: Mapping[str, Source]
     Raises:
         UserError: If they are not usable or do not share a sample time.
     """
-    axes, servos = plant.axes(), plant.servos()
-    found = [
-        e
-        for path in files(data)
-        for e in episodes(mapped(read_table(path), mapping or {}), plant.actuators, axes, servos)
+    machine = plant.machine()
+    recorded = [
+        named(table, machine) for path in sources(data) for table in tables(opened(path), mapping or {}, machine)
     ]
+    plant = driven(plant, recorded)
+    axes, servos = plant.axes(), plant.servos()
+    found = [e for table in recorded for e in episodes(table, plant.actuators, axes, servos)]
     steps = [e.dt for e in found]
     if max(steps) > 1.05 * min(steps):
         raise UserError(
             f"episodes have different sample times ({min(steps):g} to {max(steps):g} s); diagnose them apart."
         )
-    return found
+    return plant, found
 
 
 def run(
@@ -124,7 +128,7 @@ def run(
         residual_model = None if settled(best) else fit_residual_model(setup, best, sizes, rng)
         verdict = reach_verdict(setup, hypotheses, residual_model, rng, tolerated)
         bar.update(100 - bar.n)
-    notes = [n for e in recorded for n in e.notes]
+    notes = [*plant.notes, *(n for e in recorded for n in e.notes)]
     if len(recorded) == 1:
         notes.append("one episode only: its end is held out, so that both sides come from the same run")
     held = verdict.there if traces else verdict.best

@@ -67,7 +67,7 @@ def episodes(
     _moves(table, actuators, list(joints))
     check_speeds(table, joints)
     check_order(table, servos or {})
-    notes = tuple(f"{table.name}: {what}" for what in (table.lost, strange) if what)
+    notes = tuple(f"{table.name}: {what}" for what in (table.lost, *table.notes, strange) if what)
     if actuators and all(np.ptp(columns[f"ctrl/{a}"]) == 0 for a in actuators):
         notes += (f"{table.name}: the commands are constant: what acts on commands cannot show here",)
     cuts = np.flatnonzero(steps > GAP * dt) + 1

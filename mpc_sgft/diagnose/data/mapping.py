@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from dataclasses import replace
 from difflib import get_close_matches
 from pathlib import Path
 from typing import NamedTuple
@@ -115,7 +116,9 @@ def mapped(table: Table, mapping: Mapping[str, Source]) -> Table:
     used = {source.column for source in mapping.values()}
     left = {n: x for n, x in has.items() if n not in used and n not in mapping}
     made = {name: s.factor * has[s.column] + s.offset for name, s in mapping.items()}
-    return Table(table.name, left | made, table.lost)
+    offers = tuple(offer for offer in table.offers if offer.column not in used)
+    held = tuple(n for n in table.held if n in left) + tuple(n for n, s in mapping.items() if s.column in table.held)
+    return replace(table, columns=left | made, offers=offers, held=held)
 
 
 def _from_file(path: Path) -> dict[str, str]:

@@ -1,4 +1,4 @@
-"""Measured episodes, from CSV, Parquet or MCAP, checked against the model they claim to belong to.
+"""Measured episodes, and the files that hold one each: CSV, Parquet, and MCAP as deploy writes it.
 
 Columns: `time` [s], `ctrl/<actuator>`, `qpos/<joint>`, and where measured `qvel/<joint>`, `force/<actuator>`,
 `sensor/<name>`. Positions are rad or m. A command is held until the next sample: ctrl[k]
@@ -8,9 +8,9 @@ acts from time[k] to time[k + 1].
 from __future__ import annotations
 
 import csv
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,17 +20,44 @@ from mpc_sgft.storage.episode_file import read_episode
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int_]
-SUFFIXES = (".csv", ".parquet", ".mcap")
 MIN_SAMPLES = 50  # fewer cannot fill three windows
+
+
+class Offer(NamedTuple):
+    """A column under a name of its own that may be one of ours.
+
+    Attributes:
+        column: Its name.
+        kind: `qpos`, `qvel` or `ctrl`.
+        joint: What the recording calls the joint; empty if it names none.
+        quantity: What a command asks for, `position`, `velocity` or `effort`; empty if the recording does not say.
+    """
+
+    column: str
+    kind: str
+    joint: str
+    quantity: str = ""
 
 
 @dataclass(frozen=True)
 class Table:
-    """One file as it was read: columns by name, each [T], and what was lost of it (None if nothing)."""
+    """One recording as it was read.
+
+    Attributes:
+        name: Of the file or the episode.
+        columns: By name, each [T].
+        lost: What was lost of it, None if nothing.
+        notes: What was decided while reading, in words.
+        offers: Columns that may be ours under another name.
+        held: Columns that were read on another clock than their own: nan where they had not begun yet.
+    """
 
     name: str
     columns: dict[str, Array]
     lost: str | None = None
+    notes: tuple[str, ...] = ()
+    offers: tuple[Offer, ...] = ()
+    held: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -56,30 +83,6 @@ class Episode:
     @property
     def seconds(self) -> float:
         return len(self.ctrl) * self.dt
-
-
-def files(data: Sequence[str | Path]) -> list[Path]:
-    """The episode files named by paths and folders, in order.
-
-    Raises:
-        UserError: If a path is absent, a folder holds no episode, or a file has another ending.
-    """
-    found: list[Path] = []
-    for item in map(Path, data):
-        if item.is_dir():
-            inside = sorted(p for p in item.iterdir() if p.suffix.lower() in SUFFIXES)
-            if not inside:
-                raise UserError(f"{item}: no episodes in this folder. One episode is one {', '.join(SUFFIXES)} file.")
-            found += inside
-        elif not item.exists():
-            raise UserError(f"{item}: no such file or folder. Give the episodes' files, or the folder that holds them.")
-        elif item.suffix.lower() not in SUFFIXES:
-            raise UserError(f"{item}: unknown ending {item.suffix!r}. Episodes are {', '.join(SUFFIXES)} files.")
-        else:
-            found.append(item)
-    if not found:
-        raise UserError("no data given: name at least one episode file or folder (--data).")
-    return found
 
 
 def read_table(path: Path) -> Table:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import mujoco
@@ -12,8 +12,10 @@ import numpy as np
 
 from envs.effects.passive import stiffen_dry_friction
 from mpc_sgft.command.errors import UserError
-from mpc_sgft.diagnose.data.measured import Array, Index
+from mpc_sgft.diagnose.data.matching import Drive, Machine
+from mpc_sgft.diagnose.data.measured import Array, Index, Table
 from mpc_sgft.diagnose.data.units import Axis
+from mpc_sgft.diagnose.simulation.urdf import is_urdf, read_urdf
 
 SHARP = 5e-4  # [s] longest step of a fit that is judged
 FORCE = "diagnose/force/"  # sensors that are added for the comparison
@@ -72,12 +74,18 @@ class Plant:
 
     Attributes:
         spec: The nominal scene; never changed, only copied.
+        notes: What was decided while loading, in words.
+        bare: Whether its format names no actuators, so that joints whose efforts were recorded get motors.
+        said: Joints that it says are driven nevertheless.
         model: Compiled from it.
         joints: Names in the model's order.
         actuators: Names in the model's order.
     """
 
     spec: mujoco.MjSpec
+    notes: tuple[str, ...] = ()
+    bare: bool = False
+    said: tuple[str, ...] = ()
     model: mujoco.MjModel = field(init=False)
     joints: list[str] = field(init=False)
     actuators: list[str] = field(init=False)
@@ -125,6 +133,17 @@ class Plant:
         found = {a: joint_of(self, a) for i, a in enumerate(self.actuators) if m.actuator_biasprm[i, 1] < 0}
         return {a: j for a, j in found.items() if j and m.actuator(a).gear[0] > 0}
 
+    def machine(self) -> Machine:
+        """The names that a recording is matched with."""
+        m = self.model
+        asks = [
+            "position" if bias[1] < 0 else "velocity" if bias[2] < 0 else "effort"
+            for bias in m.actuator_biasprm[: m.nu]
+        ]
+        return Machine(
+            self.joints, {a: Drive(joint_of(self, a), q) for a, q in zip(self.actuators, asks, strict=True)}, self.bare
+        )
+
     def sensors(self) -> list[str]:
         """Sensors of the scene itself that give one number."""
         m = self.model
@@ -163,7 +182,7 @@ class Plant:
 
 
 def load_plant(model: str | Path | mujoco.MjModel | mujoco.MjSpec) -> Plant:
-    """A plant from an MJCF file, a spec or the model that was compiled last.
+    """A plant from an MJCF or URDF file, a spec or the model that was compiled last.
 
     Raises:
         UserError: If the file is absent or does not load, or the scene cannot be diagnosed.
@@ -175,13 +194,32 @@ def load_plant(model: str | Path | mujoco.MjModel | mujoco.MjSpec) -> Plant:
             return Plant(_decompile(model))
         path = Path(model)
         if not path.is_file():
-            raise UserError(f"{path}: no such model file. Give an MJCF scene (--model scene.xml).")
+            raise UserError(f"{path}: no such model file. Give an MJCF or URDF file (--model scene.xml).")
+        if is_urdf(path):
+            found = read_urdf(path)
+            return Plant(found.spec, found.notes, bare=True, said=found.driven)
         spec = mujoco.MjSpec.from_file(str(path))
         for kind in ("meshdir", "texturedir"):  # so that a repaired scene elsewhere finds its files
             setattr(spec, kind, str((path.parent / (getattr(spec, kind) or "")).resolve()))
         return Plant(spec)
     except ValueError as error:
         raise UserError(f"{model}: MuJoCo cannot load this scene: {error}") from error
+
+
+def driven(plant: Plant, tables: Sequence[Table]) -> Plant:
+    """A bare plant with motors at the joints whose efforts were recorded as `ctrl/<joint>`; any other as it is."""
+    if not plant.bare:
+        return plant
+    joints = [j for j in plant.joints if any(f"ctrl/{j}" in table.columns for table in tables)]
+    if not joints:
+        idle = [j for j in plant.said if j in plant.joints]
+        note = f"the URDF says that {', '.join(idle)} are driven, and no command was recorded: taken for passive"
+        return replace(plant, notes=(*plant.notes, note)) if idle else plant
+    spec = plant.spec.copy()
+    for joint in joints:
+        spec.add_actuator(name=joint, target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+    note = f"a URDF has no actuators: commands are efforts [N m or N] of motors at {', '.join(joints)}"
+    return Plant(spec, (*plant.notes, note))
 
 
 def _decompile(model: mujoco.MjModel) -> mujoco.MjSpec:

@@ -11,7 +11,8 @@ import pytest
 from mpc_sgft.command.errors import UserError
 from mpc_sgft.diagnose.__main__ import main
 from mpc_sgft.diagnose.data.check import episodes
-from mpc_sgft.diagnose.data.measured import Table, files, read_table, write_csv
+from mpc_sgft.diagnose.data.measured import Table, read_table, write_csv
+from mpc_sgft.diagnose.data.sources import sources
 from mpc_sgft.diagnose.data.units import Axis
 from mpc_sgft.diagnose.simulation.plant import load_plant
 
@@ -127,12 +128,12 @@ def test_an_uneven_clock_holds_each_command_from_its_own_time() -> None:
 
 def test_files_and_folders(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="no episodes in this folder"):
-        files([tmp_path])
+        sources([tmp_path])
     with pytest.raises(UserError, match="no such file"):
-        files([tmp_path / "absent.csv"])
+        sources([tmp_path / "absent.csv"])
     (tmp_path / "notes.txt").write_text("x")
     with pytest.raises(UserError, match="unknown ending '.txt'"):
-        files([tmp_path / "notes.txt"])
+        sources([tmp_path / "notes.txt"])
 
 
 def test_csv_and_parquet_hold_the_same(tmp_path: Path) -> None:

@@ -55,6 +55,17 @@ def test_a_foreign_recording_is_described_mapped_and_diagnosed(
     assert "columns missing" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    "other", ["--data a.csv", "--run runs/push/latest", "--out out", "--max-effects 2", "--traces"]
+)
+def test_looking_goes_with_nothing_that_runs(
+    other: str, foreign: Path, slide: Path, capsys: pytest.CaptureFixture
+) -> None:
+    assert main(["--inspect", str(foreign), "--model", str(slide), *other.split()]) == 2
+    said = capsys.readouterr()
+    assert f"{other.split()[0]} does not go with --inspect" in said.err and not said.out
+
+
 def test_little_motion_is_said(moved: Callable, slide: Path, tmp_path: Path) -> None:
     columns = moved(2.0)
     columns["qpos/x"] = 1e-4 * np.random.default_rng(0).standard_normal(len(columns["time"]))
