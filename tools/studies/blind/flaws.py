@@ -40,7 +40,12 @@ class Flaw(NamedTuple):
 
 
 def draw_flaws(
-    machine: Machine, scales: list[dict[str, float]], rng: np.random.Generator, late: str = "actuator_lag"
+    machine: Machine,
+    scales: list[dict[str, float]],
+    rng: np.random.Generator,
+    *,
+    late: str = "actuator_lag",
+    force: bool = False,
 ) -> list[Flaw]:
     """A third of the largest size to all of it, of everything, everywhere.
 
@@ -49,6 +54,8 @@ def draw_flaws(
         scales: Of each joint.
         rng: Where sizes and signs come from.
         late: Effect by which commands are late: a lag where delays come in whole steps.
+        force: Whether the drives' forces are recorded. At the instant of a new command they still show the old one if
+            commands are late at all, which is no small imperfection: then none are.
     """
     out = []
     for key, (largest, unit) in SMALL.items():
@@ -57,6 +64,7 @@ def draw_flaws(
         count = {"scene": 1, "actuator": len(machine.actuators)}.get(sits, machine.n)
         for joint in range(count):
             size = largest * _unit(unit, scales[joint]) * float(rng.uniform(1 / 3, 1))
+            size = 0.0 if key == "late" and force else size
             out.append(Flaw(name, joint, size, {"sign": float(rng.uniform()), "ratio": 0.5, "speed": 0.5}))
     return out
 

@@ -200,10 +200,14 @@ class _Batch:
     def _add_flaws(self, calm: Record, scales: list[list[dict[str, float]]]) -> None:
         """Put small imperfections into all machines, below what matters, and ask that effects matter."""
         border, before = self.ground.border, self.nominal
-        spread = np.zeros_like(self.floor)  # standard deviation of each signal, [R, n]
+        spread = np.zeros_like(self.floor)  # standard deviation of each position, [R, n], and of each measured force
+        felt = np.zeros_like(spread)
         for i, mine in enumerate(self.of):
             spread[mine] = calm.state.y[: self.count(i), 0, mine].std((0, 1))
-            self.flaws[i] = draw_flaws(self.plant, scales[i], np.random.default_rng((*self.cases[i].entropy, 5)))
+            force = calm.force[mine, : self.count(i)].std((0, 1))
+            felt[mine] = np.where((force > 0) & self.cases[i].force_channel, force, np.inf)
+            rng = np.random.default_rng((*self.cases[i].entropy, 5))
+            self.flaws[i] = draw_flaws(self.plant, scales[i], rng, force=self.cases[i].force_channel)
         self.asked = np.maximum(self.floor, border * spread)
         row, tick = window_starts(self.length, self.owner, self.dt, LONG)
 
@@ -212,8 +216,8 @@ class _Batch:
             p = {k: v.copy() for k, v in take(before, row).items()}
             for i, flaws in enumerate(chosen):
                 put(flaws, p, self.owner[row] == i, scales[i])
-            without, limit = take(before, row), border * spread[row]
-            moved = size_of(trace(self.plant, p, without, calm, row, tick, self.dt, limit, window=LONG))
+            without, limits = take(before, row), (border * spread[row], border * felt[row])
+            moved = size_of(trace(self.plant, p, without, calm, row, tick, self.dt, *limits, window=LONG))
             return np.array([np.sqrt(np.mean(moved[self.owner[row] == i] ** 2, 0)).max() for i in range(len(chosen))])
 
         each = np.array([moves([[f[k]] for f in self.flaws]) for k in range(len(self.flaws[0]))]).T  # [C, K]

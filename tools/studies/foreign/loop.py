@@ -12,6 +12,10 @@ import numpy as np
 from tools.studies.blind.plants import Array
 
 
+class Unable(ValueError):
+    """What an engine has no way to do."""
+
+
 class Engine(Protocol):
     """A machine that some physics engine moves.
 

@@ -22,7 +22,7 @@ from tools.studies.blind.plants import Array
 from tools.studies.blind.score import CLEAR
 from tools.studies.foreign.control import Tracking, left_alone, motion
 from tools.studies.foreign.draw import Case, redraw
-from tools.studies.foreign.loop import Engine, Record, Sensor, simulate
+from tools.studies.foreign.loop import Engine, Record, Sensor, Unable, simulate
 from tools.studies.foreign.scenes import SCENES, Scene, build, parameters
 
 ATTEMPTS = 8  # to draw a case whose effects matter
@@ -186,14 +186,16 @@ class _Maker:
         spread = np.concatenate([r.q for r in calm]).std(0)
         self.asked = np.maximum(self.floor, border * spread)
         rng = np.random.default_rng((*self.case.entropy, 13))
-        flaws = draw_flaws(self.scene, scales, rng, "actuator_delay")
+        force = self.case.force_channel
+        flaws = draw_flaws(self.scene, scales, rng, late="actuator_delay", force=force)
+        felt = border * np.concatenate([r.force for r in calm]).std(0) if force else None
         if self.case.swings:
             flaws = [f for f in flaws if not f.name.startswith("actuator")]
 
         def moves(chosen: list[Flaw]) -> float:
             p = {k: v.copy() for k, v in self.nominal.items()}
             put(chosen, p, np.array([0]), scales)
-            return rms(self._trace(p, calm, border * spread, LONG, every=2))
+            return rms(self._trace(p, calm, border * spread, LONG, felt, every=2))
 
         each = [moves([f]) for f in flaws]
         factors = [min(1.0, EACH / max(x, 1e-9)) for x in each]
@@ -252,12 +254,15 @@ class _Maker:
         felt = np.array([FELT * s["F"] if self.case.force_channel else np.inf for s in scales[:a]])
 
         def traces(jobs: list[tuple[int, Given | None, float]]) -> list[Array]:
-            return [
-                self._trace(self._hide([(given, size)], scales), calm, self.asked, force_floor=felt)
-                for _, given, size in jobs
-            ]
+            out = []
+            for _, given, size in jobs:
+                try:
+                    out.append(self._trace(self._hide([(given, size)], scales), calm, self.asked, force_floor=felt))
+                except Unable:  # a rival that this reality cannot have
+                    out.append(np.zeros_like(own[0]))
+            return out
 
-        effects = self.case.effects
+        effects, own = self.case.effects, []
         own = traces([(0, g, x) for g, x in zip(effects, sizes, strict=True)])
         lefts = [left_of(t, own[:k] + own[k + 1 :]) for k, t in enumerate(own)]
         if any(x < CLEAR for x in lefts):  # another case will be drawn

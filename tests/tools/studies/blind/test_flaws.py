@@ -27,6 +27,11 @@ def test_flaws_are_of_everything_everywhere_and_in_its_units() -> None:
     assert [f.size for f in shrunk(drawn[:2], [0.5, 0.0])] == [0.5 * drawn[0].size, 0.0]
 
 
+def test_commands_are_not_late_where_forces_are_read_at_the_instant_they_change() -> None:
+    late = [f.size for f in draw_flaws(SLIDE, SCALES, np.random.default_rng(0), force=True) if "lag" in f.name]
+    assert late == [0.0]
+
+
 def test_a_heavier_body_and_a_weaker_drive() -> None:
     p = rows(SLIDE, {"m": 3.0, "armature": [1.0], "damping": [2.0], "dry": [0.0], "gear": [10.0], "limit": [1e9]}, 2)
     more, less = {"sign": 1.0}, {"sign": 0.0}

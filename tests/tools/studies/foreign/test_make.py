@@ -43,6 +43,14 @@ def test_names_that_are_one_term_of_the_equations_are_found_by_simulation(made: 
     assert ["armature"] in cases.label(made)["equivalents"]
 
 
+def test_where_forces_are_recorded_no_command_is_late_and_flaws_stay_below_the_border_there() -> None:
+    """A force that is read as a command changes would show 50 us as a whole sample."""
+    swung = make.make([case("payload")._replace(force_channel=True)], ways=WAYS)[0]
+    late = [f for f in swung.more["flaws"] if f["name"] == "actuator_delay"]
+    assert [f["size"] for f in late] == [0.0] and max(f["moves"] for f in swung.more["flaws"]) <= 0.25 + 1e-9
+    assert "force/motor" in swung.episodes[0]
+
+
 def test_another_effect_is_not_equal() -> None:
     assert make.make([case("coulomb_friction", 10.0)], ways=WAYS)[0].truth[0]["equal"] == []
 
