@@ -22,6 +22,7 @@ NEEDS = {  # what a test may need, and what brings it
     "Ray": "make setup",
     "MuJoCo Warp": "make setup",
     "submitit": "make setup",
+    "PyBullet": "pip install -e '.[foreign]'",
     "Linux": "a Linux machine",
     "measured data": "MPC_SGFT_DATA=FOLDER",
     "lerobot's environment": "python -m tools.export_lerobot",

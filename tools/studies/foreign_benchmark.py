@@ -1,6 +1,6 @@
 """`diagnose` on foreign grounds: make cases from a seed, hide the labels, run, score.
 
-    python -m tools.studies.foreign_benchmark --seed 31 --cases 100 --out runs/foreign [--ground imperfect] [--jobs 2]
+    python -m tools.studies.foreign_benchmark --seed 31 --cases 100 --out runs/foreign [--ground NAME] [--jobs 2]
                                               [--only generate|run|score] [--csv results/foreign/foreign.csv]
 
 `--cases` are those of each ground. Every case has small imperfections of everything; its label holds the effects that
@@ -18,7 +18,7 @@ from tools.studies.blind import cases
 from tools.studies.blind.solve import reports
 from tools.studies.blind_benchmark import origin, run, write_rows
 from tools.studies.foreign import score
-from tools.studies.foreign.grounds import GROUNDS
+from tools.studies.foreign.grounds import GROUNDS, check
 
 STEPS = ("generate", "run", "score")
 
@@ -68,6 +68,8 @@ def main(argv: list[str]) -> int:
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # for the processes that are started
     steps, grounds = (args.only,) if args.only else STEPS, args.ground or list(GROUNDS)
     try:
+        if "generate" in steps:
+            check(grounds)
         for ground in grounds:
             folder = args.out / ground
             if "generate" in steps:

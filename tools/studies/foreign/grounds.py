@@ -1,7 +1,7 @@
 """The grounds: where the cases of each come from.
 
-`imperfect` is the blind benchmark's own generator with small imperfections of everything in every case, `scipy` are
-equations of motion under a stiff integrator.
+`imperfect` is the blind benchmark's own generator with small imperfections of everything in every case, `pybullet` that
+engine, `scipy` equations of motion under a stiff integrator.
 """
 
 from collections.abc import Callable, Mapping
@@ -14,6 +14,7 @@ from tools.studies.blind import make as blind_make
 from tools.studies.blind.plants import PLANTS
 from tools.studies.blind_benchmark import in_processes
 from tools.studies.foreign import cases, draw, make
+from tools.studies.foreign.bullet import Bullet, client
 from tools.studies.foreign.stiff import Stiff
 
 TOLERANCE = 0.01  # of each signal's standard deviation: the border between what matters and what does not
@@ -39,7 +40,18 @@ def foreign(engine: make.Engines, scenes: Mapping[str, float], out: Path, seed: 
     return cases.write(out, [made[c.name] for c in drawn], seed, TOLERANCE)
 
 
+def check(grounds: list[str]) -> None:
+    """Whether all that these grounds need is there.
+
+    Raises:
+        ValueError: If it is not.
+    """
+    if "pybullet" in grounds:
+        client()
+
+
 GROUNDS: dict[str, Callable[[Path, int, int, int], str]] = {
     "imperfect": imperfect,
+    "pybullet": partial(foreign, Bullet, {"slide": 1.0, "pendulum": 1.0, "arm": 1.0, "cartpole": 1.0, "arm3": 0.4}),
     "scipy": partial(foreign, Stiff, {"screw": 1.0, "servo": 1.0, "arm": 1.0}),
 }
