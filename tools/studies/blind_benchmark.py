@@ -17,6 +17,7 @@ import json
 import os
 import platform
 import sys
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import suppress
 from multiprocessing import Manager
@@ -57,6 +58,18 @@ def generate(out: Path, seed: int, count: int, least_none: int, arms: int = 0, j
             )
         return (out / "labels.sha256").read_text().strip()
     parts = [(make, [c for c in drawn if c.plant == plant]) for plant in PLANTS] + [(fr3_make.make, [c]) for c in extra]
+    made = in_processes(parts, total, jobs)
+    return cases.write(out, [made[c.name] for c in drawn + extra], seed)
+
+
+def in_processes(parts: Sequence[tuple[Callable[..., list[Any]], list[Any]]], total: int, jobs: int) -> dict[str, Any]:
+    """Finished cases by name.
+
+    Args:
+        parts: How to make cases, and which: how(cases, progress) -> finished cases.
+        total: Cases in all parts.
+        jobs: Processes.
+    """
     with tqdm(total=total, desc="generate", unit="case") as bar, Manager() as manager:
         done = manager.Queue()  # cases, and shares of them, that a process has finished
         with ProcessPoolExecutor(jobs) as pool:
@@ -64,8 +77,7 @@ def generate(out: Path, seed: int, count: int, least_none: int, arms: int = 0, j
             while not all(f.done() for f in futures) or not done.empty():
                 with suppress(Empty):
                     bar.update(min(done.get(timeout=0.5), total - bar.n))  # shares may add up to a little more
-        made = {one.case.name: one for f in futures for one in f.result()}
-    return cases.write(out, [made[c.name] for c in drawn + extra], seed)
+        return {one.case.name: one for f in futures for one in f.result()}
 
 
 def run(out: Path, jobs: int) -> None:
@@ -114,11 +126,9 @@ def write_scores(out: Path, target: Path, compared: dict[str, dict[str, dict[str
             if s.count:
                 rows.append({"method": method, "score": s.name, "value": round(s.value, 4), "low": round(s.low, 4)})
                 rows[-1] |= {"high": round(s.high, 4), "hits": round(s.hits, 2), "of": s.count, "goal": s.goal}
-    machine = {"seed": seed, "labels_sha256": (out / "labels.sha256").read_text().strip()[:16]}
-    machine |= {"cores": os.cpu_count(), "python": platform.python_version(), "system": platform.platform()}
-    _write(target, [row | machine for row in rows])
+    write_rows(target, [row | origin(out, seed) for row in rows])
     per_case = [_case_row(n, y, ours[n]) for n, y in hidden.items() if n in ours]
-    _write(target.with_name(target.stem + "_cases.csv"), per_case)
+    write_rows(target.with_name(target.stem + "_cases.csv"), per_case)
     pictures = draw_plots(ours, hidden, target.parent, target.stem) if ours else []
     for row in rows:
         interval = f"[{row['low']:.3f}, {row['high']:.3f}]"
@@ -142,7 +152,14 @@ def _case_row(name: str, label: dict[str, Any], report: dict[str, Any]) -> dict[
     }
 
 
-def _write(path: Path, rows: list[dict[str, Any]]) -> None:
+def origin(out: Path, seed: int) -> dict[str, Any]:
+    """Where scores come from: columns of every row."""
+    labels = {"seed": seed, "labels_sha256": (out / "labels.sha256").read_text().strip()[:16]}
+    return labels | {"cores": os.cpu_count(), "python": platform.python_version(), "system": platform.platform()}
+
+
+def write_rows(path: Path, rows: list[dict[str, Any]]) -> None:
+    """A CSV of rows with the same columns."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("w", newline="") as file:
         writer = csv.DictWriter(file, fieldnames=list(rows[0]) if rows else ["method"])

@@ -6,14 +6,15 @@ effect detectable. What else may move goes along: the other hidden effect, and a
 A solver that calls such names tied is right, and so is one that names the hidden effect; the rival alone is wrong.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Protocol
 
 import numpy as np
 from scipy.optimize import lsq_linear
 
-from tools.studies.blind.draw import Case, Given
+from tools.studies.blind.draw import Given
 from tools.studies.blind.library import EVERYTHING
-from tools.studies.blind.plants import Array, Plant
+from tools.studies.blind.plants import Array, Machine
 
 ALIKE = (
     {"actuator_gain", "sensor_gain", "payload", "armature"},
@@ -30,7 +31,16 @@ Job = tuple[int, Given | None, float]
 Traces = Callable[[list[Job]], list[Array]]
 
 
-def rivals(plant: Plant, given: Given) -> list[Given]:
+class Hiding(Protocol):
+    """What a case hides, and what its user calls uncertain."""
+
+    @property
+    def effects(self) -> tuple[Given, ...]: ...
+    @property
+    def uncertain(self) -> Mapping[str, float]: ...
+
+
+def rivals(plant: Machine, given: Given) -> list[Given]:
     """Names that may look like an effect, where they would: at its joint, or anywhere for one of the whole scene."""
     names = sorted(set().union(*(g for g in ALIKE if given.name in g)) - {given.name})
     everywhere = EVERYTHING[given.name].sits == "scene"
@@ -44,14 +54,19 @@ def rivals(plant: Plant, given: Given) -> list[Given]:
     return out
 
 
-def alike(
-    plant: Plant,
-    cases: Sequence[Case],
+def alike(*args: Any) -> list[list[list[str]]]:
+    """Names alike each effect of each case, of what `rivals_leave` is asked."""
+    return [[[n for n, left in one.items() if left < SAME] for one in case] for case in rivals_leave(*args)]
+
+
+def rivals_leave(
+    plant: Machine,
+    cases: Sequence[Hiding],
     sizes: Sequence[Sequence[float]],
     scales: Sequence[Sequence[dict[str, float]]],
     traces: Traces,
-) -> list[list[list[str]]]:
-    """Names alike each effect of each case.
+) -> list[list[dict[str, float]]]:
+    """What the best size of each rival leaves of the trace of each effect of each case [noise floors], by name.
 
     Args:
         plant: The kind of machine.
@@ -73,11 +88,11 @@ def alike(
         wanted = [g * min(max(x, 1e-3), 1e3) for g, x in zip(guesses, ratios, strict=True)]
         guesses = [min(max(g, e.smallest, 1e-9), e.largest(s)) for g, (e, s) in zip(wanted, entries, strict=True)]
     found = traces([(i, r, g) for (i, _, r), g in zip(tried, guesses, strict=True)])
-    out: list[list[list[str]]] = [[[] for _ in case.effects] for case in cases]
+    out: list[list[dict[str, float]]] = [[{} for _ in case.effects] for case in cases]
     for (i, k, rival), t in zip(tried, found, strict=True):
         others = [own[i, m] for m in range(len(cases[i].effects)) if m != k] + ([heavier[i]] if i in heavier else [])
-        if separation(own[i, k], t, others, rival.name in SIGNED) < SAME and rival.name not in out[i][k]:
-            out[i][k].append(rival.name)
+        left = separation(own[i, k], t, others, rival.name in SIGNED)
+        out[i][k][rival.name] = min(left, out[i][k].get(rival.name, np.inf))
     return out
 
 
@@ -89,10 +104,17 @@ def separation(own: Array, rival: Array, others: Sequence[Array], signed: bool) 
         others: Traces that go along, likewise.
         signed: Whether the rival may be negative.
     """
-    columns = np.stack([x.ravel() for x in (rival, *others)], 1)
+    return left_of(own, [rival, *others], 0.0 if not signed else -np.inf)
+
+
+def left_of(own: Array, others: Sequence[Array], least: float = -np.inf) -> float:
+    """What no sum of other traces makes up for, as `separation` says it; the first counts at least `least` times."""
+    if not others:
+        return float(np.sqrt(np.mean(own**2, (0, 1))).max())
+    columns = np.stack([x.ravel() for x in others], 1)
     norms = np.linalg.norm(columns, axis=0) + 1e-12
     low = np.full(len(norms), -np.inf)
-    low[0] = -np.inf if signed else 0.0
+    low[0] = least
     best = lsq_linear(columns / norms, own.ravel(), (low, np.full(len(norms), np.inf))).x
     left = own - ((columns / norms) @ best).reshape(own.shape)
     return float(np.sqrt(np.mean(left**2, (0, 1))).max())

@@ -18,33 +18,39 @@ from tools.studies.blind import fr3
 from tools.studies.blind.library import equivalents, place
 from tools.studies.blind.make import Made
 from tools.studies.blind.mjcf import build
-from tools.studies.blind.plants import PLANTS
+from tools.studies.blind.plants import PLANTS, Array
 
 DIGITS = 5  # of numbers in labels
 
 
-def write(out: Path, made: list[Made], seed: int) -> str:
+def write(out: Path, made: list[Made], seed: int, tolerance: float = 0.0) -> str:
     """Write folders and labels.
 
     Args:
         out: The benchmark's folder; made if it is not there.
         made: All cases.
         seed: They came from.
+        tolerance: What the user tolerates, as a share of the motion; 0 if nobody says.
 
     Returns:
         SHA-256 of labels.json.
     """
     for one in made:
-        folder = out / "cases" / one.case.name
-        folder.mkdir(parents=True, exist_ok=True)
         text = fr3.build() if one.case.plant == "fr3" else build(PLANTS[one.case.plant], one.case.nominal)
-        (folder / "model.xml").write_text(text)
-        (folder / "known.json").write_text(json.dumps({"uncertain": one.case.uncertain}))
-        for i, columns in enumerate(one.episodes):
-            table = np.column_stack(list(columns.values()))
-            with (folder / f"episode_{i}.csv").open("w") as file:
-                np.savetxt(file, table, fmt="%.9g", delimiter=",", header=",".join(columns), comments="")
+        known = {"uncertain": one.case.uncertain} | ({"tolerance": tolerance} if tolerance else {})
+        put(out / "cases" / one.case.name, text, known, one.episodes)
     return seal(out, {"seed": seed, "cases": {one.case.name: label(one) for one in made}})
+
+
+def put(folder: Path, model: str, known: dict[str, Any], episodes: list[dict[str, Array]]) -> None:
+    """One case as the solver gets it: the nominal MJCF, what the user knows, and a file for each episode."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "model.xml").write_text(model)
+    (folder / "known.json").write_text(json.dumps(known))
+    for i, columns in enumerate(episodes):
+        table = np.column_stack(list(columns.values()))
+        with (folder / f"episode_{i}.csv").open("w") as file:
+            np.savetxt(file, table, fmt="%.9g", delimiter=",", header=",".join(columns), comments="")
 
 
 def seal(out: Path, hidden: dict[str, Any]) -> str:
@@ -85,6 +91,7 @@ def label(made: Made) -> dict[str, Any]:
         "effects": effects,
         "equivalents": equivalents(case.plant, where, case.force_channel),
         "alike": instead([(t["name"], t["alike"]) for t in made.truth]),
+        **made.more,
     }
 
 

@@ -21,18 +21,19 @@ MOST_WINDOWS = 6  # of one machine
 ROUNDS = 5
 
 
-def window_starts(seconds: Array, owner: Array, dt: float) -> tuple[Array, Array]:
+def window_starts(seconds: Array, owner: Array, dt: float, window: float = WINDOW) -> tuple[Array, Array]:
     """Where windows begin, evenly spread, at most MOST_WINDOWS for each owner.
 
     Args:
         seconds: Length of each row [s], [R].
         owner: Case that each row belongs to, [R].
         dt: Tick [s].
+        window: Length [s].
 
     Returns:
         Row and tick of each window (with its lead), [W] each.
     """
-    span = LEAD + WINDOW
+    span = LEAD + window
     row, tick = [], []
     for case in np.unique(owner):
         mine = []
@@ -55,6 +56,7 @@ def trace(
     dt: float,
     floor: Array,
     force_floor: Array | None = None,
+    window: float = WINDOW,
 ) -> Array:
     """What the effect changes in what is measured, in noise floors, [W, T, n + a], for W windows.
 
@@ -68,8 +70,9 @@ def trace(
         dt: Tick [s].
         floor: Noise floor [m or rad], [W, n].
         force_floor: Of the measured forces of the drives [N or N m], inf where none is measured, [W, a]; or None.
+        window: Length [s].
     """
-    lead, total = round(LEAD / dt), round((LEAD + WINDOW) / dt)
+    lead, total = round(LEAD / dt), round((LEAD + window) / dt)
     total = min(total, reference.ctrl.shape[1])
     per_tick = round(dt / H)
     ctrl = np.stack([reference.ctrl[r, k : k + total] for r, k in zip(row, tick, strict=True)])

@@ -1,5 +1,6 @@
 """Which cases there are: kinds of plant, effects, noise, data, from one seed. Sizes come later, from the noise."""
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -30,6 +31,23 @@ FAMILIES = (
 )
 FRICTION_PAIRS = ({"viscous_friction", "coulomb_friction"}, {"asymmetric_friction", "coulomb_friction"})
 INERTIAL = {"payload", "armature", "actuator_gain", "sensor_gain", "gravity_tilt"}  # too close to a wrong mass or gain
+
+
+class Mix(NamedTuple):
+    """How often each group occurs, and how large what is hidden in it is [detectable sizes].
+
+    Attributes:
+        shares: Of all cases, by group; sum 1.
+        single, pair, outside: Smallest and largest size.
+    """
+
+    shares: Mapping[str, float]
+    single: tuple[float, float]
+    pair: tuple[float, float]
+    outside: tuple[float, float]
+
+
+BLIND = Mix(SHARES, MULTIPLE, (1.5, MULTIPLE[1]), (3.0, MULTIPLE[1]))
 
 
 class Given(NamedTuple):
@@ -77,40 +95,40 @@ class Case(NamedTuple):
     entropy: tuple[int, ...]
 
 
-def draw(seed: int, count: int, least_none: int = 0) -> list[Case]:
+def draw(seed: int, count: int, least_none: int = 0, mix: Mix = BLIND) -> list[Case]:
     """The cases of a seed, in an order that says nothing.
 
     Args:
         seed: Of everything.
         count: How many.
         least_none: Cases without effect are added until there are this many, beyond `count`.
+        mix: Groups and sizes.
 
     Raises:
         ValueError: If count is below 1.
     """
     if count < 1:
         raise ValueError(f"cases={count}: at least one is needed")
+    return [_case(i, group, rank, seed, mix) for i, (group, rank) in enumerate(groups(seed, count, least_none, mix))]
+
+
+def groups(seed: int, count: int, least_none: int, mix: Mix) -> list[tuple[str, int]]:
+    """Group of each case in an order that says nothing, and how many of that group come before it."""
     rng = np.random.default_rng((seed, 2718))
-    edges = np.round(np.cumsum(list(SHARES.values())) * count).astype(int)
-    groups = [name for name, n in zip(SHARES, np.diff(edges, prepend=0), strict=True) for _ in range(n)]
-    groups += ["none"] * max(0, least_none - groups.count("none"))
-    order = rng.permutation(len(groups))
-    ranks = {name: 0 for name in SHARES}
-    cases = []
-    for i, where in enumerate(order):
-        group = groups[where]
-        cases.append(_case(i, group, ranks[group], seed))
-        ranks[group] += 1
-    return cases
+    edges = np.round(np.cumsum(list(mix.shares.values())) * count).astype(int)
+    every = [name for name, n in zip(mix.shares, np.diff(edges, prepend=0), strict=True) for _ in range(n)]
+    every += ["none"] * max(0, least_none - every.count("none"))
+    shuffled = [every[where] for where in rng.permutation(len(every))]
+    return [(group, shuffled[:i].count(group)) for i, group in enumerate(shuffled)]
 
 
-def redraw(case: Case, attempt: int) -> Case:
+def redraw(case: Case, attempt: int, mix: Mix = BLIND) -> Case:
     """Another case of the same group in place of one whose effect cannot reach the size that was drawn."""
     seed, index, rank = case.entropy[:3]
-    return _case(index, case.group, rank, seed, attempt)
+    return _case(index, case.group, rank, seed, mix, attempt)
 
 
-def _case(index: int, group: str, rank: int, seed: int, attempt: int = 0) -> Case:
+def _case(index: int, group: str, rank: int, seed: int, mix: Mix, attempt: int = 0) -> Case:
     entropy = (seed, index, rank, attempt)
     rng = np.random.default_rng((*entropy, 1))
     name = str(rng.choice(list(PLANTS)))
@@ -121,15 +139,15 @@ def _case(index: int, group: str, rank: int, seed: int, attempt: int = 0) -> Cas
     force = bool(rng.uniform() < 0.3)
     if group == "single":
         options = sorted(SITES[name])
-        effects = (given(options[int(rng.integers(len(options)))], SITES[name], rng, MULTIPLE),)
+        effects = (given(options[int(rng.integers(len(options)))], SITES[name], rng, mix.single),)
         force |= effects[0].name in ("actuator_delay", "sensor_delay", "actuator_offset")
     elif group == "pair":
         first, second = pair(name, rng)
-        effects = tuple(given(n, SITES[name], rng, (1.5, MULTIPLE[1])) for n in (first, second))
+        effects = tuple(given(n, SITES[name], rng, mix.pair) for n in (first, second))
         force |= bool({"actuator_delay", "sensor_delay"} & {first, second})
     elif group == "outside":
         options = sorted(OUTSIDE_SITES[name])
-        effects = (given(options[rank % len(options)], OUTSIDE_SITES[name], rng, (3.0, MULTIPLE[1])),)
+        effects = (given(options[rank % len(options)], OUTSIDE_SITES[name], rng, mix.outside),)
     elif group == "ambiguous":
         kind = ("equivalent", "one_speed", "short")[rank % 3]
         name, effects, seconds = _ambiguous(kind, name, seconds, rng)

@@ -86,9 +86,12 @@ def _wave(kind: str, t: Array, rng: np.random.Generator) -> Array:
         return _triangle(t, speed=rng.uniform(0.08, 0.3), period=rng.uniform(1.0, 2.5), phase=rng.uniform())
     if kind == "fast":
         return rng.uniform(0.3, 0.6) * np.sin(2 * np.pi * rng.uniform(1.0, 2.5) * t)
+    if kind == "chirp":  # not drawn by `plan`
+        low, high, seconds = rng.uniform(0.1, 0.3), rng.uniform(1.5, 3.0), max(float(t[-1]), 1e-9)
+        return 0.5 * np.sin(2 * np.pi * (low * t + (high - low) * t * t / (2 * seconds)))
     if kind == "reversals":
         return _triangle(t, speed=rng.uniform(0.4, 1.2), period=rng.uniform(0.3, 0.8), phase=rng.uniform())
-    raise ValueError(f"No motion {kind!r}; allowed are {', '.join(KINDS)}.")
+    raise ValueError(f"No motion {kind!r}; allowed are {', '.join(KINDS)}, chirp.")
 
 
 def _triangle(t: Array, speed: float, period: float, phase: float) -> Array:

@@ -6,19 +6,37 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tools.studies.blind.alike import alike
+from tools.studies.blind.alike import HEAVIER, Job, Traces, alike, left_of
 from tools.studies.blind.detect import LEAD, WINDOW, detectable, size_of, trace, window_starts
-from tools.studies.blind.draw import COUNT, EPISODE, NOISE, TICK, Case, Given, redraw
+from tools.studies.blind.draw import BLIND, COUNT, EPISODE, NOISE, TICK, Case, Given, Mix, redraw
 from tools.studies.blind.excite import Reference, plan, reference
+from tools.studies.blind.flaws import EACH, TOGETHER, Flaw, draw_flaws, put, shrunk, weigh
+from tools.studies.blind.flaws import WINDOW as LONG
 from tools.studies.blind.library import EVERYTHING
 from tools.studies.blind.loop import JITTER_STEPS, H, Record, Sensor, Tracking, simulate, start
 from tools.studies.blind.plants import PLANTS, Array, Plant
+from tools.studies.blind.score import CLEAR
 from tools.studies.blind.truths import join, rows, take
 
 ATTEMPTS = 6  # to draw a case whose effects can be made large enough
 TIMESTAMP_SD = 5e-6  # [s] of the clock, where there is jitter
-BODY_MASSES = ("m", "m1", "m2", "i", "i1", "i2")
 WILD = {"slide": 1.5, "hinge": 6.0}  # [m or rad] a run that goes further is made again with smaller effects
+
+
+class Ground(NamedTuple):
+    """What reality is like beside the effects of a case.
+
+    Attributes:
+        mix: Groups, and sizes of what is hidden.
+        border: Change of predictions that matters, as a share of a signal's standard deviation. Where it is above 0,
+            every case gets flaws below it, and an effect counts as detectable only at a size that matters, too.
+    """
+
+    mix: Mix = BLIND
+    border: float = 0.0
+
+
+PLAIN = Ground()
 
 
 class Made(NamedTuple):
@@ -29,15 +47,17 @@ class Made(NamedTuple):
         episodes: One mapping of columns [T] for each file.
         truth: For the labels: for each effect name, joint, size, detectable size, multiple, parameters.
         floor: Noise floor of each joint [m or rad].
+        more: What else the label says.
     """
 
     case: Case
     episodes: list[dict[str, Array]]
     truth: list[dict[str, Any]]
     floor: list[float]
+    more: dict[str, Any] = {}
 
 
-def label(given: Given, size: float, unit: float, scale: dict[str, float], others: list[list[str]]) -> dict[str, Any]:
+def label(given: Given, size: float, unit: float, scale: dict[str, float], others: list[str]) -> dict[str, Any]:
     """What the labels say of one effect.
 
     Args:
@@ -59,13 +79,14 @@ def label(given: Given, size: float, unit: float, scale: dict[str, float], other
     }
 
 
-def make(cases: list[Case], progress: Callable[[float], object] = lambda n: None) -> list[Made]:
+def make(cases: list[Case], progress: Callable[[float], object] = lambda n: None, ground: Ground = PLAIN) -> list[Made]:
     """All cases, in their order. Those of one plant are simulated together.
 
     Args:
         cases: As `draw.draw` gives them.
         progress: Called with the number of cases, or parts of them, that were finished; negative for those that have
             to be made anew.
+        ground: What else reality has.
     """
     done: dict[str, Made] = {}
     todo = list(cases)
@@ -76,10 +97,12 @@ def make(cases: list[Case], progress: Callable[[float], object] = lambda n: None
         todo = []
         for batch in batches.values():
             count = len(batch)
-            finished = _Batch(batch).finish(attempt == ATTEMPTS, lambda share, count=count: progress(share * count))
+            finished = _Batch(batch, ground).finish(
+                attempt == ATTEMPTS, lambda share, count=count: progress(share * count)
+            )
             for case, made in zip(batch, finished, strict=True):
                 if made is None:
-                    todo.append(redraw(case, attempt))
+                    todo.append(redraw(case, attempt, ground.mix))
                     progress(-1)
                 else:
                     done[case.name] = made
@@ -98,8 +121,8 @@ def _hold_on(ref: Reference, ticks: int) -> Reference:
 class _Batch:
     """Cases of one plant; every episode is a row. Shorter episodes are cut from rows as long as the longest."""
 
-    def __init__(self, cases: list[Case]) -> None:
-        self.cases = cases
+    def __init__(self, cases: list[Case], ground: Ground) -> None:
+        self.cases, self.ground = cases, ground
         self.plant: Plant = PLANTS[cases[0].plant]
         self.dt = TICK[self.plant.name]
         counts = [round(c.seconds / EPISODE[c.seconds]) for c in cases]
@@ -111,12 +134,12 @@ class _Batch:
         self.nominal = {k: v.copy() for k, v in self.believed.items()}
         for case, mine in zip(cases, self.of, strict=True):
             self.nominal["clock"][mine] = np.arange(len(mine)) * EPISODE[case.seconds]
-            for name in BODY_MASSES:
-                if name in self.nominal:
-                    self.nominal[name][mine] *= case.wrong.get("mass", 1.0)
+            weigh(self.nominal, mine, case.wrong.get("mass", 1.0))
             self.nominal["gear"][mine] *= case.wrong.get("gain", 1.0)
         self.motion = self._motion()
         self.floor, self.sensor = self._sensor()
+        self.asked = self.floor  # change that makes an effect detectable, [R, n]
+        self.flaws: list[list[Flaw]] = [[] for _ in cases]
 
     def count(self, i: int) -> int:
         """Samples in each episode of case i."""
@@ -132,6 +155,9 @@ class _Batch:
         quiet = self.sensor._replace(noise=np.zeros_like(self.sensor.noise), early=np.zeros_like(self.sensor.early))
         calm = self._run(self.nominal, quiet)
         scales = [self._scales(calm, i) for i in range(len(self.cases))]
+        if self.ground.border:
+            self._add_flaws(calm, scales)
+            calm = self._run(self.nominal, quiet)
         progress(0.3)
         unit = self._detectable(calm, scales)
         progress(0.4)
@@ -161,12 +187,74 @@ class _Batch:
                 break
             sizes = [s if ok else [0.5 * x for x in s] for s, ok in zip(sizes, sane, strict=True)]
         progress(0.1)
-        same = self._alike(calm, scales, sizes)
+        traces = self._tracer(calm, scales)
+        same = alike(self.plant, self.cases, sizes, scales, traces)
+        made = [self._made(i, record, sizes[i], unit[i], scales[i], same[i]) for i in range(len(self.cases))]
+        if self.ground.border:
+            own = self._own(traces, sizes)
+            made = [self._weighed(one, i, own[i]) for i, one in enumerate(made)]
+            fits &= np.array([all(e["left"] >= CLEAR for e in one.truth) for one in made])
         progress(0.2)
-        return [
-            self._made(i, record, sizes[i], unit[i], scales[i], same[i]) if (fits[i] and sane[i]) or last else None
-            for i in range(len(self.cases))
+        return [one if (fits[i] and sane[i]) or last else None for i, one in enumerate(made)]
+
+    def _add_flaws(self, calm: Record, scales: list[list[dict[str, float]]]) -> None:
+        """Put small imperfections into all machines, below what matters, and ask that effects matter."""
+        border, before = self.ground.border, self.nominal
+        spread = np.zeros_like(self.floor)  # standard deviation of each position, [R, n], and of each measured force
+        felt = np.zeros_like(spread)
+        for i, mine in enumerate(self.of):
+            spread[mine] = calm.state.y[: self.count(i), 0, mine].std((0, 1))
+            force = calm.force[mine, : self.count(i)].std((0, 1))
+            felt[mine] = np.where((force > 0) & self.cases[i].force_channel, force, np.inf)
+            rng = np.random.default_rng((*self.cases[i].entropy, 5))
+            self.flaws[i] = draw_flaws(self.plant, scales[i], rng, force=self.cases[i].force_channel)
+        self.asked = np.maximum(self.floor, border * spread)
+        row, tick = window_starts(self.length, self.owner, self.dt, LONG)
+
+        def moves(chosen: list[list[Flaw]]) -> Array:
+            """By how much these flaws of each case move predictions [borders], [C]."""
+            p = {k: v.copy() for k, v in take(before, row).items()}
+            for i, flaws in enumerate(chosen):
+                put(flaws, p, self.owner[row] == i, scales[i])
+            without, limits = take(before, row), (border * spread[row], border * felt[row])
+            moved = size_of(trace(self.plant, p, without, calm, row, tick, self.dt, *limits, window=LONG))
+            return np.array([np.sqrt(np.mean(moved[self.owner[row] == i] ** 2, 0)).max() for i in range(len(chosen))])
+
+        each = np.array([moves([[f[k]] for f in self.flaws]) for k in range(len(self.flaws[0]))]).T  # [C, K]
+        shrink = np.minimum(1.0, EACH / np.maximum(each, 1e-9))
+        self.flaws = [shrunk(f, list(x)) for f, x in zip(self.flaws, shrink, strict=True)]
+        together = np.minimum(1.0, TOGETHER / np.maximum(moves(self.flaws), 1e-9))
+        self.flaws = [shrunk(f, [x] * len(f)) for f, x in zip(self.flaws, together, strict=True)]
+        self.moved = each * shrink * together[:, None]
+        self.nominal = {k: v.copy() for k, v in before.items()}
+        for i, mine in enumerate(self.of):
+            put(self.flaws[i], self.nominal, mine, scales[i])
+
+    def _own(self, traces: Traces, sizes: list[list[float]]) -> list[list[tuple[float, float]]]:
+        """Of each effect of each case: what it changes, and what of that the others cannot make up for [detectable]."""
+        found = traces([(i, g, x) for i, c in enumerate(self.cases) for g, x in zip(c.effects, sizes[i], strict=True)])
+        unsure = [i for i, c in enumerate(self.cases) if c.effects and c.uncertain]
+        heavier = dict(zip(unsure, traces([(i, None, HEAVIER) for i in unsure]), strict=True))
+        out, queue = [], iter(found)
+        for i, case in enumerate(self.cases):
+            mine = [next(queue) for _ in case.effects]
+            held = [heavier[i]] if i in heavier else []
+            others = [[x for m, x in enumerate(mine) if m != k] + held for k in range(len(mine))]
+            out.append(
+                [
+                    (float(size_of(t[None].reshape(1, -1, t.shape[-1])).max()), left_of(t, rest))
+                    for t, rest in zip(mine, others, strict=True)
+                ]
+            )
+        return out
+
+    def _weighed(self, made: Made, i: int, own: list[tuple[float, float]]) -> Made:
+        truth = [{**t, "weight": w, "left": left} for t, (w, left) in zip(made.truth, own, strict=True)]
+        flaws = [
+            {"name": f.name, "joint": f.joint, "size": f.size, "moves": float(m)}
+            for f, m in zip(self.flaws[i], self.moved[i], strict=True)
         ]
+        return made._replace(truth=truth, more={"flaws": flaws})
 
     def _truth(self, sizes: list[list[float]], scales: list[list[dict[str, float]]]) -> dict[str, Array]:
         p = {k: v.copy() for k, v in self.nominal.items()}
@@ -265,7 +353,7 @@ class _Batch:
         mine = np.concatenate(windows)
         ends = np.cumsum([len(w) for w in windows])
         spans = [np.arange(end - len(w), end) for w, end in zip(windows, ends, strict=True)]
-        nominal, floor = take(self.nominal, row[mine]), self.floor[row[mine]]
+        nominal, floor = take(self.nominal, row[mine]), self.asked[row[mine]]
         entries = [EVERYTHING[given.name] for _, given in hidden]
         place = [scales[i][given.joint] for i, given in hidden]
 
@@ -287,14 +375,12 @@ class _Batch:
             units[i].append(float(size))
         return units
 
-    def _alike(
-        self, calm: Record, scales: list[list[dict[str, float]]], sizes: list[list[float]]
-    ) -> list[list[list[str]]]:
-        """Names that these data cannot tell from each effect of each case (see alike)."""
+    def _tracer(self, calm: Record, scales: list[list[dict[str, float]]]) -> Traces:
+        """What effects change in these data (see alike)."""
         row, tick = window_starts(self.length, self.owner, self.dt)
         windows = {i: np.flatnonzero(self.owner[row] == i) for i, case in enumerate(self.cases) if case.effects}
 
-        def traces(jobs: list[tuple[int, Given | None, float]]) -> list[Array]:
+        def traces(jobs: list[Job]) -> list[Array]:
             """Of an effect at a size, or of a heavier machine (None, share), in a case: [W, T, channels] each."""
             if not jobs:
                 return []
@@ -305,18 +391,17 @@ class _Batch:
             for (i, given, size), end in zip(jobs, ends, strict=True):
                 span = np.arange(end - len(windows[i]), end)
                 if given is None:
-                    for name in (n for n in BODY_MASSES if n in p):
-                        p[name][span] *= 1 + size
+                    weigh(p, span, 1 + size)
                 else:
                     EVERYTHING[given.name].apply(p, span, given.joint, size, given.shape, scales[i][given.joint])
                 sd = [0.01 * s["F"] if self.cases[i].force_channel else np.inf for s in scales[i]]
                 felt += [sd[: len(self.plant.actuators)]] * len(span)
             found = trace(
-                self.plant, p, nominal, calm, row[mine], tick[mine], self.dt, self.floor[row[mine]], np.array(felt)
+                self.plant, p, nominal, calm, row[mine], tick[mine], self.dt, self.asked[row[mine]], np.array(felt)
             )
             return np.split(np.where(np.isfinite(found), found, 1e6), ends[:-1])
 
-        return alike(self.plant, self.cases, sizes, scales, traces)
+        return traces
 
     def _made(
         self,

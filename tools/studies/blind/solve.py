@@ -42,6 +42,7 @@ def solve(case: Path, out: Path, names: list[str] | None = None, seed: int = 0) 
             uncertain=known["uncertain"] or None,
             seed=seed,
             max_effects=len(names) if names else 3,
+            tolerance=known.get("tolerance"),
         ).as_dict()
     except Exception as error:  # a crash is a result of the benchmark, with its trace beside it
         (out / "traceback.txt").write_text(traceback.format_exc())
