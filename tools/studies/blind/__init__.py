@@ -9,6 +9,7 @@
 | excite.py    | reference motions                                                                             |
 | loop.py      | controller, drive, plant and encoder in closed loop, or the plant driven by recorded commands |
 | library.py   | every effect: where it can sit, how large it may be, what parameters the solver should report |
+| flaws.py     | small imperfections of everything, below what matters                                         |
 | detect.py    | the size at which an effect becomes detectable                                                |
 | fr3.py       | the FR3 in MuJoCo with other numerics, and callbacks for what the model lacks                 |
 | fr3_friction.py | dry friction of its joints by events                                                       |

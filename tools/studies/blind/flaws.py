@@ -4,7 +4,7 @@ A flaw is an effect of the library, or another mass, at a size that matters to n
 until each moves predictions by at most EACH of what matters, and all of them together by at most TOGETHER of it.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -37,6 +37,9 @@ class Flaw(NamedTuple):
     joint: int
     size: float
     shape: Mapping[str, float]
+
+
+Moves = Callable[[list[list[Flaw]]], Array]
 
 
 def draw_flaws(
@@ -90,6 +93,26 @@ def weigh(p: dict[str, Array], rows: Any, factor: float) -> None:
             p[name][rows] *= factor
 
 
-def shrunk(flaws: list[Flaw], factors: list[float]) -> list[Flaw]:
-    """The same at other sizes."""
-    return [f._replace(size=f.size * x) for f, x in zip(flaws, factors, strict=True)]
+def below(flaws: list[list[Flaw]], moves: Moves) -> tuple[list[list[Flaw]], Array]:
+    """Flaws of several cases, as many of each, small enough; and by how much each moves predictions [borders], [C, K].
+
+    Args:
+        flaws: As drawn, by case.
+        moves: Flaws of each case -> by how much these together move its predictions [borders], [C].
+    """
+    each = np.array([moves([[f[k]] for f in flaws]) for k in range(len(flaws[0]))]).T
+    factors = np.minimum(1.0, EACH / np.maximum(each, 1e-9))
+    small = [_times(f, x) for f, x in zip(flaws, factors, strict=True)]
+    together = np.minimum(1.0, TOGETHER / np.maximum(moves(small), 1e-9))[:, None]
+    return [_times(f, x) for f, x in zip(flaws, factors * together, strict=True)], each * factors * together
+
+
+def _times(flaws: list[Flaw], factors: Array) -> list[Flaw]:
+    return [f._replace(size=f.size * float(x)) for f, x in zip(flaws, factors, strict=True)]
+
+
+def as_label(flaws: list[Flaw], moved: Array) -> list[dict[str, Any]]:
+    """What the label says of the flaws of a case."""
+    return [
+        {"name": f.name, "joint": f.joint, "size": f.size, "moves": float(m)} for f, m in zip(flaws, moved, strict=True)
+    ]

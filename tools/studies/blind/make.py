@@ -10,8 +10,8 @@ from tools.studies.blind.alike import HEAVIER, Job, Traces, alike, left_of
 from tools.studies.blind.detect import LEAD, WINDOW, detectable, size_of, trace, window_starts
 from tools.studies.blind.draw import BLIND, COUNT, EPISODE, NOISE, TICK, Case, Given, Mix, redraw
 from tools.studies.blind.excite import Reference, plan, reference
-from tools.studies.blind.flaws import EACH, TOGETHER, Flaw, draw_flaws, put, shrunk, weigh
 from tools.studies.blind.flaws import WINDOW as LONG
+from tools.studies.blind.flaws import Flaw, as_label, below, draw_flaws, put, weigh
 from tools.studies.blind.library import EVERYTHING
 from tools.studies.blind.loop import JITTER_STEPS, H, Record, Sensor, Tracking, simulate, start
 from tools.studies.blind.plants import PLANTS, Array, Plant
@@ -220,12 +220,7 @@ class _Batch:
             moved = size_of(trace(self.plant, p, without, calm, row, tick, self.dt, *limits, window=LONG))
             return np.array([np.sqrt(np.mean(moved[self.owner[row] == i] ** 2, 0)).max() for i in range(len(chosen))])
 
-        each = np.array([moves([[f[k]] for f in self.flaws]) for k in range(len(self.flaws[0]))]).T  # [C, K]
-        shrink = np.minimum(1.0, EACH / np.maximum(each, 1e-9))
-        self.flaws = [shrunk(f, list(x)) for f, x in zip(self.flaws, shrink, strict=True)]
-        together = np.minimum(1.0, TOGETHER / np.maximum(moves(self.flaws), 1e-9))
-        self.flaws = [shrunk(f, [x] * len(f)) for f, x in zip(self.flaws, together, strict=True)]
-        self.moved = each * shrink * together[:, None]
+        self.flaws, self.moved = below(self.flaws, moves)
         self.nominal = {k: v.copy() for k, v in before.items()}
         for i, mine in enumerate(self.of):
             put(self.flaws[i], self.nominal, mine, scales[i])
@@ -250,11 +245,7 @@ class _Batch:
 
     def _weighed(self, made: Made, i: int, own: list[tuple[float, float]]) -> Made:
         truth = [{**t, "weight": w, "left": left} for t, (w, left) in zip(made.truth, own, strict=True)]
-        flaws = [
-            {"name": f.name, "joint": f.joint, "size": f.size, "moves": float(m)}
-            for f, m in zip(self.flaws[i], self.moved[i], strict=True)
-        ]
-        return made._replace(truth=truth, more={"flaws": flaws})
+        return made._replace(truth=truth, more={"flaws": as_label(self.flaws[i], self.moved[i])})
 
     def _truth(self, sizes: list[list[float]], scales: list[list[dict[str, float]]]) -> dict[str, Array]:
         p = {k: v.copy() for k, v in self.nominal.items()}

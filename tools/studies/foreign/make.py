@@ -13,8 +13,8 @@ import numpy as np
 from tools.studies.blind.alike import SAME, left_of, rivals_leave
 from tools.studies.blind.detect import LEAD, WINDOW, detectable, window_starts
 from tools.studies.blind.draw import COUNT, NOISE, Given
-from tools.studies.blind.flaws import EACH, TOGETHER, Flaw, draw_flaws, put, shrunk
 from tools.studies.blind.flaws import WINDOW as LONG
+from tools.studies.blind.flaws import Flaw, as_label, below, draw_flaws, put
 from tools.studies.blind.library import EVERYTHING
 from tools.studies.blind.make import WILD, Ground
 from tools.studies.blind.make import label as label_of
@@ -104,7 +104,7 @@ class _Maker:
         if calm is None:
             return None
         scales = self._scales(calm)
-        flaws, moved = self._add_flaws(calm, scales)
+        flaws = self._add_flaws(calm, scales)
         calm = self._run(self.nominal)
         if calm is None:
             return None
@@ -124,13 +124,7 @@ class _Maker:
         record = self._run(self._hide(zip(case.effects, sizes, strict=True), scales))
         if record is None or any(t["left"] < CLEAR for t in truth):
             return None
-        more = {
-            "flaws": [
-                {"name": f.name, "joint": f.joint, "size": f.size, "moves": m}
-                for f, m in zip(flaws, moved, strict=True)
-            ]
-        }
-        return Made(case, self._columns(record, scales), self.xml, truth, more)
+        return Made(case, self._columns(record, scales), self.xml, truth, {"flaws": flaws})
 
     def _hide(self, effects: Any, scales: list[dict[str, float]]) -> Rows:
         """Parameters of reality with these (effect, size) pairs."""
@@ -180,8 +174,8 @@ class _Maker:
             out.append({k: max(x, 1e-6) for k, x in numbers.items()} | {"gear": 1.0 if self.scene.servo else gain})
         return out
 
-    def _add_flaws(self, calm: list[Record], scales: list[dict[str, float]]) -> tuple[list[Flaw], list[float]]:
-        """Put small imperfections into reality; they, and by how much each moves predictions [borders]."""
+    def _add_flaws(self, calm: list[Record], scales: list[dict[str, float]]) -> list[dict[str, Any]]:
+        """Put small imperfections into reality; what the label says of them."""
         border = self.ways.ground.border
         spread = np.concatenate([r.q for r in calm]).std(0)
         self.asked = np.maximum(self.floor, border * spread)
@@ -192,18 +186,14 @@ class _Maker:
         if self.case.swings:
             flaws = [f for f in flaws if not f.name.startswith("actuator")]
 
-        def moves(chosen: list[Flaw]) -> float:
+        def moves(chosen: list[list[Flaw]]) -> Array:
             p = {k: v.copy() for k, v in self.nominal.items()}
-            put(chosen, p, np.array([0]), scales)
-            return rms(self._trace(p, calm, border * spread, LONG, felt, every=2))
+            put(chosen[0], p, np.array([0]), scales)
+            return np.array([rms(self._trace(p, calm, border * spread, LONG, felt, every=2))])
 
-        each = [moves([f]) for f in flaws]
-        factors = [min(1.0, EACH / max(x, 1e-9)) for x in each]
-        flaws = shrunk(flaws, factors)
-        rest = min(1.0, TOGETHER / max(moves(flaws), 1e-9))
-        flaws = shrunk(flaws, [rest] * len(flaws))
+        (flaws,), (moved,) = below([flaws], moves)
         put(flaws, self.nominal, np.array([0]), scales)
-        return flaws, [x * f * rest for x, f in zip(each, factors, strict=True)]
+        return as_label(flaws, moved)
 
     def _trace(
         self,

@@ -5,7 +5,7 @@ import pytest
 
 from tools.studies.blind.cases import label
 from tools.studies.blind.draw import Case, Given, Mix, draw
-from tools.studies.blind.flaws import SMALL, Flaw, draw_flaws, put, shrunk
+from tools.studies.blind.flaws import SMALL, Flaw, below, draw_flaws, put
 from tools.studies.blind.make import Ground, Made, make
 from tools.studies.blind.plants import PLANTS
 from tools.studies.blind.truths import rows
@@ -24,7 +24,6 @@ def test_flaws_are_of_everything_everywhere_and_in_its_units() -> None:
         f.size for k in range(50) for f in draw_flaws(SLIDE, SCALES, np.random.default_rng(k)) if "viscous" in f.name
     ]
     assert 0.02 <= min(many) and 0.05 < max(many) <= 0.06  # 0.1 to 0.3 % of 10 N at 0.5 m/s
-    assert [f.size for f in shrunk(drawn[:2], [0.5, 0.0])] == [0.5 * drawn[0].size, 0.0]
 
 
 def test_commands_are_not_late_where_forces_are_read_at_the_instant_they_change() -> None:
@@ -38,6 +37,19 @@ def test_a_heavier_body_and_a_weaker_drive() -> None:
     put([Flaw("mass", 0, 0.003, more), Flaw("actuator_gain", 0, 0.002, less)], p, np.array([1]), SCALES)
     assert p["m"].tolist() == [3.0, pytest.approx(3.009)]
     assert p["gain"][:, 0].tolist() == [1.0, pytest.approx(0.998)]
+
+
+def test_flaws_shrink_until_each_and_all_are_small() -> None:
+    def flaws(*sizes: float) -> list[Flaw]:
+        return [Flaw("viscous_friction", 0, x, {}) for x in sizes]
+
+    def moves(chosen: list[list[Flaw]]) -> np.ndarray:
+        return np.array([sum(f.size for f in case) for case in chosen])
+
+    found, moved = below([flaws(0.1, 0.2, 0.1), flaws(0.5, 0.25, 0.5)], moves)
+    assert [f.size for f in found[0]] == pytest.approx([0.1, 0.2, 0.1])
+    assert [f.size for f in found[1]] == pytest.approx([0.5 / 3] * 3)  # a quarter each, then half together
+    assert moved.tolist() == [pytest.approx([f.size for f in case]) for case in found]
 
 
 @pytest.fixture(scope="module")

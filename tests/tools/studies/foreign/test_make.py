@@ -51,6 +51,17 @@ def test_where_forces_are_recorded_no_command_is_late_and_flaws_stay_below_the_b
     assert "force/motor" in swung.episodes[0]
 
 
+def test_a_flaw_that_shows_in_a_servos_force_is_smaller_where_that_is_recorded() -> None:
+    first = next(c for c in draw(3, 40, {"servo": 1.0}, MIX) if c.group == "none")
+    first = first._replace(seconds=(1.5,), dt=0.005, noise=0)
+
+    def stretched(force: bool) -> float:
+        made = make.make([first._replace(force_channel=force)], ways=WAYS)[0]
+        return next(f["size"] for f in made.more["flaws"] if f["name"] == "sensor_gain")
+
+    assert stretched(True) < 0.9 * stretched(False)
+
+
 def test_another_effect_is_not_equal() -> None:
     assert make.make([case("coulomb_friction", 10.0)], ways=WAYS)[0].truth[0]["equal"] == []
 
