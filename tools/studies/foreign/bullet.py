@@ -113,7 +113,7 @@ class Bullet:
         for k, joint in enumerate(self.joints):
             b.changeDynamics(self.body, joint, maxJointVelocity=FASTEST)
             mine = k if not self.elastic else max(k - 1, 0)  # the joint of ours that this one belongs to
-            if not (self.elastic and k == 1):
+            if not (self.elastic and k < 2):
                 b.changeDynamics(self.body, joint, jointDamping=min(self.p["b_pos"][mine], self.p["b_neg"][mine]))
             hold = 0.0 if self.elastic and k == 1 else self.p["c_pos"][mine]
             b.setJointMotorControl2(self.body, joint, b.VELOCITY_CONTROL, targetVelocity=0, force=hold)
@@ -136,6 +136,7 @@ class Bullet:
                 self._vary(loads)
             if self.elastic:
                 push = [push[0], self._spring(), *push[1:]]
+                self._damp()
             b.setJointMotorControlArray(self.body, self.joints, b.TORQUE_CONTROL, forces=push)
             b.stepSimulation()
             self.states = [s[:2] for s in b.getJointStates(self.body, self.joints)]
@@ -154,6 +155,14 @@ class Bullet:
         """What drives the link behind an elastic transmission; in a play nothing does but its limits."""
         twist, rate = self.states[1]
         return 0.0 if self.p["gap"][0] else -self.p["stiffness"][0] * twist - self.p["twist_damping"][0] * rate
+
+    def _damp(self) -> None:
+        """Damping of the first joint behind its transmission: the link moves against the world, not the rotor."""
+        b, force = self.engine, -min(self.p["b_pos"][0], self.p["b_neg"][0]) * self._links()[0][1]
+        if self.scene.kinds[0] == "slide":
+            b.applyExternalForce(self.body, self.joints[1], [force, 0, 0], [0, 0, 0], b.LINK_FRAME)
+        else:
+            b.applyExternalTorque(self.body, self.joints[1], [0, -force, 0], b.WORLD_FRAME)
 
     def _extra(self, j: int) -> float:
         """What resists beside damping and dry friction."""

@@ -4,6 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from tools.studies.blind.library import LIBRARY
 from tools.studies.foreign.loop import Record, simulate
 from tools.studies.foreign.scenes import SCENES, Scene, build, draw_nominal, parameters
 from tools.studies.foreign.stiff import Stiff
@@ -93,6 +94,8 @@ def test_an_arm_without_friction_keeps_its_energy() -> None:
         ("slide", {"kinetic": 1.0, "static": 2.0, "stribeck_speed": 0.05}),
         ("slide", {"load": 0.2}),
         ("pendulum", {"elastic": 1.0, "stiffness": 40.0, "twist_damping": 0.02}),
+        ("pendulum", {"elastic": 1.0, "stiffness": 5.0, "twist_damping": 0.02, "b_pos": 0.1, "b_neg": 0.1}),
+        ("slide", {"elastic": 1.0, "stiffness": 300.0, "twist_damping": 1.0, "b_pos": 20.0, "b_neg": 20.0}),
     ],
 )
 def test_effects_do_what_they_do_in_the_other_engine(name: str, effects: dict[str, float]) -> None:
@@ -102,6 +105,18 @@ def test_effects_do_what_they_do_in_the_other_engine(name: str, effects: dict[st
     one, two = (run(scene, numbers, *start, engine=engine, **effects).q for engine in (Bullet, Stiff))
     change = np.sqrt(np.mean((two - run(scene, numbers, *start, engine=Stiff).q) ** 2))
     assert change > 1e-3 and np.sqrt(np.mean((one - two) ** 2)) < 0.03 * change
+
+
+@pytest.mark.parametrize("name", ["slide", "pendulum", "arm"])
+def test_play_does_about_what_a_hard_spring_behind_it_does(name: str) -> None:
+    """The rest is the law of impact, each engine's own."""
+    scene, numbers = machine(name)
+    p, start = parameters(scene, numbers), (np.zeros(scene.n), np.zeros(scene.n))
+    commands = 0.2 * np.sin(0.03 * np.arange(500)[:, None] + np.arange(len(scene.actuators)))
+    base = simulate(Stiff(scene, p), p, start, 500, DT, commands).q
+    LIBRARY["backlash"].apply(p, np.array([0]), 0, 0.05 * np.ptp(base[:, 0]), {}, {})
+    one, two = (simulate(engine(scene, p), p, start, 500, DT, commands).q for engine in (Bullet, Stiff))
+    assert np.sqrt(np.mean((one - two) ** 2)) < 0.13 * np.sqrt(np.mean((two - base) ** 2))
 
 
 def test_dry_friction_holds_exactly_below_its_level_and_lets_go_above() -> None:
