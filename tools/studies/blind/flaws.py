@@ -4,11 +4,12 @@ A flaw is an effect of the library, or another mass, at a size that matters to n
 until each moves predictions by at most EACH of what matters, and all of them together by at most TOGETHER of it.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from tools.studies.blind.draw import Given
 from tools.studies.blind.library import EVERYTHING, Scales
 from tools.studies.blind.plants import Array, Machine
 
@@ -27,6 +28,14 @@ SMALL: dict[str, tuple[float, str]] = {  # largest size drawn, in which scale of
     "joint_stiffness": (0.001, "F/Q"),
     "gravity_tilt": (0.0005, ""),
     "sensor_gain": (0.0005, ""),
+}
+
+
+ADDS_TO = {  # flaw -> effects beside its own that it would only make larger or smaller
+    "viscous_friction": ("asymmetric_friction",),
+    "coulomb_friction": ("stribeck_friction",),
+    "actuator_lag": ("actuator_delay",),
+    "actuator_delay": ("actuator_lag",),
 }
 
 
@@ -75,6 +84,16 @@ def draw_flaws(
 def _unit(unit: str, s: Scales) -> float:
     top, _, bottom = unit.partition("/")
     return (s[top] if top else 1.0) / float(np.prod([s[letter] for letter in bottom]))
+
+
+def beside(flaws: list[Flaw], hidden: Sequence[Given]) -> list[Flaw]:
+    """The same, but nothing of what adds to a hidden effect at its joint: the label says how large that is."""
+    known = {(e.name, e.joint) for e in hidden}
+
+    def adds(flaw: Flaw) -> bool:
+        return any((name, flaw.joint) in known for name in (flaw.name, *ADDS_TO.get(flaw.name, ())))
+
+    return [f._replace(size=0.0) if adds(f) else f for f in flaws]
 
 
 def put(flaws: list[Flaw], p: dict[str, Array], rows: Any, scales: list[dict[str, float]]) -> None:

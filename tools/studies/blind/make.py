@@ -11,7 +11,7 @@ from tools.studies.blind.detect import LEAD, WINDOW, detectable, size_of, trace,
 from tools.studies.blind.draw import BLIND, COUNT, EPISODE, NOISE, TICK, Case, Given, Mix, redraw
 from tools.studies.blind.excite import Reference, plan, reference
 from tools.studies.blind.flaws import WINDOW as LONG
-from tools.studies.blind.flaws import Flaw, as_label, below, draw_flaws, put, weigh
+from tools.studies.blind.flaws import Flaw, as_label, below, beside, draw_flaws, put, weigh
 from tools.studies.blind.library import EVERYTHING
 from tools.studies.blind.loop import JITTER_STEPS, H, Record, Sensor, Tracking, simulate, start
 from tools.studies.blind.plants import PLANTS, Array, Plant
@@ -207,7 +207,8 @@ class _Batch:
             force = calm.force[mine, : self.count(i)].std((0, 1))
             felt[mine] = np.where((force > 0) & self.cases[i].force_channel, force, np.inf)
             rng = np.random.default_rng((*self.cases[i].entropy, 5))
-            self.flaws[i] = draw_flaws(self.plant, scales[i], rng, force=self.cases[i].force_channel)
+            drawn = draw_flaws(self.plant, scales[i], rng, force=self.cases[i].force_channel)
+            self.flaws[i] = beside(drawn, self.cases[i].effects)
         self.asked = np.maximum(self.floor, border * spread)
         row, tick = window_starts(self.length, self.owner, self.dt, LONG)
 

@@ -14,7 +14,7 @@ from tools.studies.blind.alike import SAME, left_of, rivals_leave
 from tools.studies.blind.detect import LEAD, WINDOW, detectable, window_starts
 from tools.studies.blind.draw import COUNT, NOISE, Given
 from tools.studies.blind.flaws import WINDOW as LONG
-from tools.studies.blind.flaws import Flaw, as_label, below, draw_flaws, put
+from tools.studies.blind.flaws import Flaw, as_label, below, beside, draw_flaws, put
 from tools.studies.blind.library import EVERYTHING
 from tools.studies.blind.make import WILD, Ground
 from tools.studies.blind.make import label as label_of
@@ -181,7 +181,8 @@ class _Maker:
         self.asked = np.maximum(self.floor, border * spread)
         rng = np.random.default_rng((*self.case.entropy, 13))
         force = self.case.force_channel
-        flaws = draw_flaws(self.scene, scales, rng, late="actuator_delay", force=force)
+        drawn = draw_flaws(self.scene, scales, rng, late="actuator_delay", force=force)
+        flaws = beside(drawn, self.case.effects)
         felt = border * np.concatenate([r.force for r in calm]).std(0) if force else None
         if self.case.swings:
             flaws = [f for f in flaws if not f.name.startswith("actuator")]

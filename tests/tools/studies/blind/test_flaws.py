@@ -5,7 +5,7 @@ import pytest
 
 from tools.studies.blind.cases import label
 from tools.studies.blind.draw import Case, Given, Mix, draw
-from tools.studies.blind.flaws import SMALL, Flaw, below, draw_flaws, put
+from tools.studies.blind.flaws import SMALL, Flaw, below, beside, draw_flaws, put
 from tools.studies.blind.make import Ground, Made, make
 from tools.studies.blind.plants import PLANTS
 from tools.studies.blind.truths import rows
@@ -37,6 +37,13 @@ def test_a_heavier_body_and_a_weaker_drive() -> None:
     put([Flaw("mass", 0, 0.003, more), Flaw("actuator_gain", 0, 0.002, less)], p, np.array([1]), SCALES)
     assert p["m"].tolist() == [3.0, pytest.approx(3.009)]
     assert p["gain"][:, 0].tolist() == [1.0, pytest.approx(0.998)]
+
+
+def test_nothing_adds_to_what_the_label_gives_a_size() -> None:
+    hidden = (Given("asymmetric_friction", 1, 4.0, {}), Given("actuator_offset", 0, 4.0, {}))
+    drawn = draw_flaws(PLANTS["cartpole"], SCALES * 2, np.random.default_rng(0))
+    gone = {(f.name, f.joint) for f in beside(drawn, hidden) if f.size == 0.0}
+    assert gone == {("viscous_friction", 1), ("actuator_offset", 0)}
 
 
 def test_flaws_shrink_until_each_and_all_are_small() -> None:
