@@ -117,6 +117,8 @@ def _no_name(
             return "unknown", f"a flexible residual model explains {share:.1%} more of the error than {_list(there)}"
     times = np.sqrt(mean_error(setup, best, told))
     if not best.effects:
+        if tolerance.asked and not settled(base) and not tolerance.allows(there.fit):
+            return "unknown", "the nominal model's error is beyond the tolerance, and no name explains it"
         if there.effects:
             return "none", f"{_list(there)} is there, and too small to matter"
         if settled(base):

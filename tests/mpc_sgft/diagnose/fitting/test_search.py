@@ -383,3 +383,17 @@ def test_what_is_left_within_the_tolerance_is_no_unknown(limit: float, kind: str
     verdict = reach_verdict(setup, [judge_fit(setup, setup.baseline), named], None, rng, allowed)
     assert verdict.kind == kind, verdict.reason
     assert [t.term.effect for t in verdict.traces] == (["b"] if kind == "none" else [])
+
+
+@pytest.mark.parametrize(
+    ("limit", "asked", "kind"), [(0.5, True, "unknown"), (4.0, True, "none"), (0.5, False, "none")]
+)
+def test_an_error_beyond_the_tolerance_that_no_name_explains_is_unknown(limit: float, asked: bool, kind: str) -> None:
+    problem, fitted, none, rng = Lines(), np.arange(18), np.zeros(1), np.random.default_rng(5)
+    problem.y = 3 * rng.normal(size=problem.y.shape)
+    setup = Setup(problem, fitted, np.arange(18, 24), fitted // 3, fit(problem, [], [], fitted), none, none, np.log1p)
+    setup = replace(setup, squared=np.expm1)
+    wrong = judge_fit(setup, fit(problem, [term("b")], [np.ones(1)], fitted))
+    allowed = motion(problem, limit, asked)
+    verdict = reach_verdict(setup, [judge_fit(setup, setup.baseline), wrong], None, rng, allowed)
+    assert verdict.kind == kind, verdict.reason
