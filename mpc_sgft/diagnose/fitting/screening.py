@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -201,33 +201,17 @@ def pair_up(parent: Hypothesis, samples: list[Sample], setup: Setup[Any], effort
 
     The residuals of two effects are taken for the nominal model's, moved by the one and by the other: no simulation.
     """
-    rows = np.searchsorted(setup.fitted, spread(setup.fitted, effort.screen_windows))
-    r0, J0 = parent.fit.r[rows], parent.fit.J[rows]
-    root = np.sqrt(weights(r0))[:, None, None]
-    parts = [r0[..., None], J0, *(x for s in samples for x in (s.moved[..., None], s.J))]
-    columns = (np.concatenate(parts, -1) * root).reshape(r0.size, -1)
-    gram = columns.T @ columns
-    ends = np.cumsum([p.shape[-1] for p in parts])
-    nominal = np.arange(1, ends[1])
-    moved = ends[1::2][: len(samples)]  # column of how each effect moves the residuals; its derivatives follow
-    both: dict[tuple[int, int], list[tuple[int, int]]] = {}  # pairs, by their numbers of parameters
-    for j, second in enumerate(samples):
-        for i, first in enumerate(samples[:j]):
-            if first.term.label != second.term.label and not _overlap(first.term, second.term):
-                both.setdefault((len(first.start), len(second.start)), []).append((i, j))
-    best: dict[frozenset[str], tuple[float, tuple[int, int], Array]] = {}
-    for (p, q), pairs in both.items():
-        i, j = np.array(pairs).T
-        own = [moved[k][:, None] + 1 + np.arange(n) for k, n in ((i, p), (j, q))]
-        free = np.concatenate([np.broadcast_to(nominal, (len(pairs), len(nominal))), *own], 1)
-        fixed = np.stack([np.zeros_like(i), moved[i], moved[j]], 1)
-        starts = [[*parent.fit.values, samples[a].start, samples[b].start] for a, b in pairs]
-        bounds = [[*parent.fit.terms, samples[a].term, samples[b].term] for a, b in pairs]
-        steps, costs = _steps(gram, free, fixed, starts, bounds)
-        for pair, step, cost in zip(pairs, steps, costs, strict=True):
-            key = key_of(setup, (*parent.fit.terms, *(samples[k].term for k in pair)))
-            if key not in best or cost < best[key][0]:
-                best[key] = float(cost), pair, step
+    pairs = [
+        (i, j)
+        for j, second in enumerate(samples)
+        for i, first in enumerate(samples[:j])
+        if first.term.label != second.term.label and not _overlap(first.term, second.term)
+    ]
+    best: dict[frozenset[str], tuple[float, Sequence[int], Array]] = {}
+    for pair, step, cost in _beside(setup, parent, samples, pairs, effort):
+        key = key_of(setup, (*parent.fit.terms, *(samples[k].term for k in pair)))
+        if key not in best or cost < best[key][0]:
+            best[key] = cost, pair, step
     out = []
     for cost, pair, step in sorted(best.values(), key=lambda x: x[0])[: effort.pairs]:
         terms = (*parent.fit.terms, *(samples[k].term for k in pair))
@@ -238,26 +222,42 @@ def pair_up(parent: Hypothesis, samples: list[Sample], setup: Setup[Any], effort
     return out
 
 
-def _steps(
-    gram: Array, free: Index, fixed: Index, starts: list[list[Array]], terms: list[list[Term]]
-) -> tuple[Array, Array]:
-    """Gauss-Newton steps of many sets within bounds, in typical sizes, and the squares that they leave, [N, P] and [N].
+def _beside(
+    setup: Setup[Any], parent: Hypothesis, samples: Sequence[Sample], sets: Sequence[Sequence[int]], effort: Effort
+) -> Iterator[tuple[Sequence[int], Array, float]]:
+    """Sets of samples beside a set of effects: each with its Gauss-Newton step within bounds, in typical sizes, over
+    the parent's parameters and its own, and the squares that this leaves.
 
-    Args:
-        gram: Products of all columns.
-        free, fixed: Columns of each set that have a step, and those that are as they are, [N, P] and [N, 3].
-        starts, terms: Of each set.
+    Residuals are the parent's, moved by each sample as it moves the nominal model's: no simulation.
     """
-    A, g = gram[free[:, :, None], free[:, None]], gram[free[:, :, None], fixed[:, None]].sum(2)
-    ridge = 1e-3 * np.einsum("npp->np", A) + 1e-12
-    step = -np.linalg.solve(A + ridge[:, :, None] * np.eye(free.shape[1]), g[..., None])[..., 0]
-    start, low, high, size = (
-        np.array([np.concatenate(x) for x in rows])
-        for rows in (starts, *([[getattr(t, k) for t in ts] for ts in terms] for k in ("low", "high", "size")))
-    )
-    step = (np.clip(start + step * size, low, high) - start) / size
-    left = gram[fixed[:, :, None], fixed[:, None]].sum((1, 2))
-    return step, left + 2 * np.einsum("np,np->n", g, step) + np.einsum("np,npq,nq->n", step, A, step)
+    rows = np.searchsorted(setup.fitted, spread(setup.fitted, effort.screen_windows))
+    r0, J0 = parent.fit.r[rows], parent.fit.J[rows]
+    root = np.sqrt(weights(r0))[:, None, None]
+    parts = [r0[..., None], J0, *(x for s in samples for x in (s.moved[..., None], s.J))]
+    columns = (np.concatenate(parts, -1) * root).reshape(r0.size, -1)
+    gram = columns.T @ columns
+    ends = np.cumsum([p.shape[-1] for p in parts])
+    moved = ends[1::2][: len(samples)]  # column of how each effect moves the residuals; its derivatives follow
+    alike: dict[tuple[int, ...], list[Sequence[int]]] = {}  # sets, by their effects' numbers of parameters
+    for one in sets:
+        alike.setdefault(tuple(len(samples[k].start) for k in one), []).append(one)
+    for counts, some in alike.items():
+        own = [moved[k][:, None] + 1 + np.arange(n) for k, n in zip(np.array(some).T, counts, strict=True)]
+        free = np.concatenate([np.tile(np.arange(1, ends[1]), (len(some), 1)), *own], 1)
+        fixed = np.concatenate([np.zeros((len(some), 1), int), moved[np.array(some)]], 1)
+        A, g = gram[free[:, :, None], free[:, None]], gram[free[:, :, None], fixed[:, None]].sum(2)
+        ridge = 1e-3 * np.einsum("npp->np", A) + 1e-12
+        step = -np.linalg.solve(A + ridge[:, :, None] * np.eye(free.shape[1]), g[..., None])[..., 0]
+        terms = [[*parent.fit.terms, *(samples[k].term for k in one)] for one in some]
+        start = np.array([np.concatenate([*parent.fit.values, *(samples[k].start for k in one)]) for one in some])
+        low, high, size = (
+            np.array([np.concatenate([getattr(t, what) for t in ts]) for ts in terms])
+            for what in ("low", "high", "size")
+        )
+        step = (np.clip(start + step * size, low, high) - start) / size
+        cost = gram[fixed[:, :, None], fixed[:, None]].sum((1, 2)) + 2 * np.einsum("np,np->n", g, step)
+        cost += np.einsum("np,npq,nq->n", step, A, step)
+        yield from zip(some, step, cost.tolist(), strict=True)
 
 
 def glance(setup: Setup[Any], parent: Hypothesis, options: list[Option], effort: Effort) -> list[Sample]:
@@ -279,24 +279,17 @@ def worth_a_look(
         setup: Problem and baseline.
         parent: The set that they extend.
         options: As from `proposals`.
-        samples: What each effect does to the nominal model, as from `screen`.
+        samples: What each effect does to the nominal model, as from `glance` or `screen`.
         effort: How widely.
     """
     added = {o.terms[o.new].label for o in options if o.new == len(parent.fit.terms)}
     if len(added) <= effort.most:
         return options
-    rows = np.searchsorted(setup.fitted, spread(setup.fitted, effort.screen_windows))
-    r0, J0 = parent.fit.r[rows], parent.fit.J[rows]
-    root = np.sqrt(weights(r0))[:, None, None]
     left: dict[str, float] = {}
-    for s in samples:
-        if s.term.label in added:
-            J = (np.concatenate([J0, s.J], -1) * root).reshape(r0.size, -1)
-            r = ((r0 + s.moved) * root[..., 0]).ravel()
-            step = np.linalg.lstsq(J, -r, rcond=1e-6)[0]
-            new = slice(J0.shape[-1], None)
-            step[new] = (np.clip(s.start + step[new] * s.term.size, s.term.low, s.term.high) - s.start) / s.term.size
-            left[s.term.label] = min(left.get(s.term.label, np.inf), float(np.sum((r + J @ step) ** 2)))
+    some = [(k,) for k, s in enumerate(samples) if s.term.label in added]
+    for (k,), _, cost in _beside(setup, parent, samples, some, effort):
+        label = samples[k].term.label
+        left[label] = min(left.get(label, np.inf), cost)
     best = set(sorted(left, key=left.__getitem__)[: effort.most])
     return [o for o in options if o.new < len(parent.fit.terms) or o.terms[o.new].label in best]
 
