@@ -186,10 +186,7 @@ def main(argv: list[str]) -> int:
     try:
         if "generate" in steps:
             generate(args.out, args.seed, args.cases, args.least_none, args.fr3, args.jobs)
-        cases.labels(args.out)
-        if cases.seed_of(args.out) != args.seed:
-            raise ValueError(f"{args.out} holds cases of seed {cases.seed_of(args.out)}, not of {args.seed}")
-        print("labels SHA-256", (args.out / "labels.sha256").read_text().strip(), flush=True)
+        print("labels SHA-256", cases.sealed(args.out, args.seed), flush=True)
         if args.only == "pack" and not args.pack:
             raise ValueError("--only pack needs the file: --pack results/blind/blind_reports.jsonl.gz")
         if args.pack and args.pack.is_file():

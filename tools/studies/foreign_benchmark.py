@@ -74,10 +74,7 @@ def main(argv: list[str]) -> int:
             folder = args.out / ground
             if "generate" in steps:
                 generate(folder, ground, args.seed, args.cases, args.jobs)
-            cases.labels(folder)
-            if cases.seed_of(folder) != args.seed:
-                raise ValueError(f"{folder} holds cases of seed {cases.seed_of(folder)}, not of {args.seed}")
-            print(ground, "labels SHA-256", (folder / "labels.sha256").read_text().strip(), flush=True)
+            print(ground, "labels SHA-256", cases.sealed(folder, args.seed), flush=True)
         if "run" in steps:
             for ground in grounds:
                 run(args.out / ground, args.jobs)

@@ -16,6 +16,9 @@
 | fr3_draw.py  | which cases of the FR3 there are                                                              |
 | fr3_make.py  | their data                                                                                    |
 | draw.py      | which cases there are, from a seed                                                            |
+| made.py      | what a finished case is, on which ground, and what the labels say of its effects              |
+| batch.py, make.py | the data of all cases, those of one plant together                                       |
+| alike.py     | names that a case's data cannot tell apart                                                    |
 | cases.py     | folders of cases, labels apart from them, the hash of the labels                              |
 | solve.py     | runs `diagnose` on the folders                                                                |
 | features.py, baselines.py | simpler ways to name an effect, for comparison                                   |

@@ -16,7 +16,7 @@ import numpy as np
 
 from tools.studies.blind import fr3
 from tools.studies.blind.library import equivalents, place
-from tools.studies.blind.make import Made
+from tools.studies.blind.made import Made
 from tools.studies.blind.mjcf import build
 from tools.studies.blind.plants import PLANTS, Array
 
@@ -120,6 +120,18 @@ def labels(out: Path) -> dict[str, dict[str, Any]]:
 def label_hashes(out: Path) -> dict[str, str]:
     """SHA-256 of each case's own label, by case name: of a label that is alike on two processors, alike."""
     return {name: hashlib.sha256(json.dumps(x).encode()).hexdigest()[:16] for name, x in labels(out).items()}
+
+
+def sealed(out: Path, seed: int) -> str:
+    """The hash of the labels, if they are of this seed and still those whose hash was printed.
+
+    Raises:
+        ValueError: If they are not.
+    """
+    labels(out)
+    if seed_of(out) != seed:
+        raise ValueError(f"{out} holds cases of seed {seed_of(out)}, not of {seed}")
+    return (out / "labels.sha256").read_text().strip()
 
 
 def seed_of(out: Path) -> int:

@@ -17,7 +17,7 @@ from tools.studies.blind.excite import plan, reference
 from tools.studies.blind.fr3 import NUMERICS, Arm, Run, build, nominal, reality, simulate
 from tools.studies.blind.fr3_draw import LEAST, redraw
 from tools.studies.blind.library import EVERYTHING
-from tools.studies.blind.make import TIMESTAMP_SD, Made, label
+from tools.studies.blind.made import TIMESTAMP_SD, Made, label
 from tools.studies.blind.plants import Array
 
 TICK = 0.004  # [s]

@@ -10,7 +10,8 @@ from pathlib import Path
 
 from tools.studies.blind import cases as blind_cases
 from tools.studies.blind import draw as blind_draw
-from tools.studies.blind import make as blind_make
+from tools.studies.blind.made import Ground
+from tools.studies.blind.make import make as make_blind
 from tools.studies.blind.plants import PLANTS
 from tools.studies.blind_benchmark import in_processes
 from tools.studies.foreign import cases, draw, make
@@ -20,14 +21,14 @@ from tools.studies.foreign.stiff import Stiff
 TOLERANCE = 0.01  # of each signal's standard deviation: the border between what matters and what does not
 SIZES = (3.0, 20.0)  # of what is hidden [detectable sizes]
 MIX = blind_draw.Mix({"single": 0.5, "pair": 0.2, "none": 0.15, "outside": 0.15}, SIZES, SIZES, SIZES)
-GROUND = blind_make.Ground(MIX, TOLERANCE)
+GROUND = Ground(MIX, TOLERANCE)
 SHARE = 4  # cases that a process makes at a time
 
 
 def imperfect(out: Path, seed: int, count: int, jobs: int) -> str:
     """Cases and labels of the blind generator with flaws on disk; the labels' hash."""
     drawn = blind_draw.draw(seed, count, mix=MIX)
-    how = partial(blind_make.make, ground=GROUND)
+    how = partial(make_blind, ground=GROUND)
     made = in_processes([(how, [c for c in drawn if c.plant == plant]) for plant in PLANTS], count, jobs)
     return blind_cases.write(out, [made[c.name] for c in drawn], seed, TOLERANCE)
 

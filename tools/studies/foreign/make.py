@@ -16,8 +16,8 @@ from tools.studies.blind.draw import COUNT, NOISE, Given
 from tools.studies.blind.flaws import WINDOW as LONG
 from tools.studies.blind.flaws import Flaw, as_label, below, beside, draw_flaws, put
 from tools.studies.blind.library import EVERYTHING
-from tools.studies.blind.make import WILD, Ground
-from tools.studies.blind.make import label as label_of
+from tools.studies.blind.made import WILD, Ground
+from tools.studies.blind.made import label as label_of
 from tools.studies.blind.plants import Array
 from tools.studies.blind.score import CLEAR
 from tools.studies.foreign.control import Tracking, left_alone, motion

@@ -6,7 +6,8 @@ import pytest
 from tools.studies.blind.cases import label
 from tools.studies.blind.draw import Case, Given, Mix, draw
 from tools.studies.blind.flaws import SMALL, Flaw, below, beside, draw_flaws, put
-from tools.studies.blind.make import Ground, Made, make
+from tools.studies.blind.made import Ground, Made
+from tools.studies.blind.make import make
 from tools.studies.blind.plants import PLANTS
 from tools.studies.blind.truths import rows
 

@@ -1,84 +1,42 @@
 """PyBullet's machines obey mechanics, are what their MJCF says but for the error of their steps, and truly stick."""
 
-import mujoco
 import numpy as np
 import pytest
 
+from tests.tools.studies.foreign.machines import DT, beside_mujoco, energies, machine, run
 from tools.studies.blind.library import LIBRARY
-from tools.studies.foreign.loop import Record, simulate
-from tools.studies.foreign.scenes import SCENES, Scene, build, draw_nominal, parameters
+from tools.studies.foreign.loop import simulate
+from tools.studies.foreign.scenes import parameters
 from tools.studies.foreign.stiff import Stiff
 
 pytest.importorskip("pybullet", reason="needs PyBullet")
 from tools.studies.foreign.bullet import STEP, Bullet  # noqa: E402
 
-DT = 0.002
 NAMES = ("slide", "pendulum", "arm", "cartpole", "arm3")
-
-
-def machine(name: str, **change: list[float]) -> tuple[Scene, dict]:
-    scene = SCENES[name]
-    return scene, draw_nominal(scene, np.random.default_rng(1)) | {"dry": [0.0] * scene.n} | change
-
-
-def run(
-    scene: Scene,
-    numbers: dict,
-    q: list[float],
-    v: list[float],
-    ticks: int,
-    commands=None,
-    engine=Bullet,
-    **effects: float,
-) -> Record:
-    p = parameters(scene, numbers)
-    for name, value in effects.items():
-        p[name][..., 0] = value
-    made = engine(scene, p)
-    commands = np.zeros((ticks, made.drives)) if commands is None else commands
-    return simulate(made, p, (np.array(q), np.array(v)), ticks, DT, commands)
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_nominal_machines_agree_with_mujoco_within_a_few_steps(name: str) -> None:
-    scene, numbers = machine(name)
-    model = mujoco.MjModel.from_xml_string(build(scene, numbers))
-    model.opt.timestep = DT / 10
-    data = mujoco.MjData(model)
-    start = [0.2, -0.3, 0.1][: scene.n]
-    data.qpos[:] = start
-    commands = np.array([[0.3 * np.sin(0.02 * k + j) for j in range(model.nu)] for k in range(250)])
-    record, worst = run(scene, numbers, start, [0.0] * scene.n, 250, commands), np.zeros(scene.n)
-    for k, command in enumerate(commands):
-        worst = np.maximum(worst, np.abs(data.qpos - record.q[k]))
-        data.ctrl[:] = command
-        for _ in range(10):
-            mujoco.mj_step(model, data)
+    record, worst = beside_mujoco(Bullet, name, 250)
     assert np.all(worst < 1e-3 * np.ptp(record.q, 0))  # a tenth of what matters, over the longest half window
     assert np.all(worst < 10 * STEP * np.abs(record.v).max())
 
 
 def test_the_error_of_a_free_pendulum_is_first_order_in_the_step(monkeypatch: pytest.MonkeyPatch) -> None:
     scene, numbers = machine("pendulum", damping=[0.0])
-    exact = run(scene, numbers, [1.0], [0.0], 1000, engine=Stiff).q
+    exact = run(Stiff, scene, numbers, [1.0], [0.0], 1000).q
     errors = []
     for step in (STEP, 4 * STEP):
         monkeypatch.setattr("tools.studies.foreign.bullet.STEP", step)
-        errors.append(np.sqrt(np.mean((run(scene, numbers, [1.0], [0.0], 1000).q - exact) ** 2)))
+        errors.append(np.sqrt(np.mean((run(Bullet, scene, numbers, [1.0], [0.0], 1000).q - exact) ** 2)))
     assert 3.0 < errors[1] / errors[0] < 5.0
     assert errors[0] < 2.5e-4 * exact.std()  # over 2 s; 1 % matters
 
 
 def test_an_arm_without_friction_keeps_its_energy() -> None:
     scene, numbers = machine("arm", damping=[0.0, 0.0])
-    record = run(scene, numbers, [1.0, -0.5], [0.0, 0.0], 1000)
-    model = mujoco.MjModel.from_xml_string(build(scene, numbers))
-    model.opt.enableflags |= mujoco.mjtEnableBit.mjENBL_ENERGY
-    data, energy = mujoco.MjData(model), []
-    for k in (0, 400, 999):
-        data.qpos[:], data.qvel[:] = record.q[k], record.v[k]
-        mujoco.mj_forward(model, data)
-        energy.append(data.energy.copy())
+    record = run(Bullet, scene, numbers, [1.0, -0.5], [0.0, 0.0], 1000)
+    energy = energies(scene, numbers, record, (0, 400, 999))
     assert np.ptp(np.sum(energy, 1)) < 2e-3 * np.ptp(energy, 0)[1]
 
 
@@ -102,8 +60,8 @@ def test_effects_do_what_they_do_in_the_other_engine(name: str, effects: dict[st
     scene, numbers = machine(name, damping=[0.0])
     commands = 0.4 * np.sin(0.02 * np.arange(500))[:, None]
     start = [0.1], [0.0], 500, commands
-    one, two = (run(scene, numbers, *start, engine=engine, **effects).q for engine in (Bullet, Stiff))
-    change = np.sqrt(np.mean((two - run(scene, numbers, *start, engine=Stiff).q) ** 2))
+    one, two = (run(engine, scene, numbers, *start, **effects).q for engine in (Bullet, Stiff))
+    change = np.sqrt(np.mean((two - run(Stiff, scene, numbers, *start).q) ** 2))
     assert change > 1e-3 and np.sqrt(np.mean((one - two) ** 2)) < 0.03 * change
 
 
@@ -122,7 +80,7 @@ def test_play_does_about_what_a_hard_spring_behind_it_does(name: str) -> None:
 def test_dry_friction_holds_exactly_below_its_level_and_lets_go_above() -> None:
     scene, numbers = machine("slide", gear=[10.0], damping=[0.0])
     held, moving = (
-        run(scene, numbers, [0.1], [0.0], 500, np.full((500, 1), u), c_pos=5.0, c_neg=5.0) for u in (0.49, 0.6)
+        run(Bullet, scene, numbers, [0.1], [0.0], 500, np.full((500, 1), u), c_pos=5.0, c_neg=5.0) for u in (0.49, 0.6)
     )
     assert abs(held.q[-1, 0] - 0.1) < 1e-9 and abs(held.v[-1, 0]) < 1e-9
     mass = numbers["m"][0] + numbers["armature"][0]

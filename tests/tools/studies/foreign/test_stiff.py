@@ -5,49 +5,22 @@ import numpy as np
 import pytest
 from scipy.special import ellipk
 
-from tools.studies.foreign.loop import simulate
-from tools.studies.foreign.scenes import SCENES, Scene, build, draw_nominal, parameters
+from tests.tools.studies.foreign.machines import DT, beside_mujoco, energies, machine, run
+from tools.studies.foreign.scenes import build, parameters
 from tools.studies.foreign.stiff import CREEP, Stiff
 
 NAMES = ("screw", "slide", "servo", "pendulum", "arm")
-DT = 0.002
-
-
-def machine(name: str, **change: list[float]) -> tuple[Scene, dict]:
-    scene = SCENES[name]
-    return scene, draw_nominal(scene, np.random.default_rng(1)) | {"dry": [0.0] * scene.n} | change
-
-
-def run(scene: Scene, numbers: dict, q: list[float], v: list[float], ticks: int, commands=None, **effects: float):
-    p = parameters(scene, numbers)
-    for name, value in effects.items():
-        p[name][..., 0] = value
-    engine = Stiff(scene, p)
-    commands = np.zeros((ticks, engine.drives)) if commands is None else commands
-    return simulate(engine, p, (np.array(q), np.array(v)), ticks, DT, commands)
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_nominal_machines_agree_with_mujoco_on_their_mjcf(name: str) -> None:
-    scene, numbers = machine(name)
-    model = mujoco.MjModel.from_xml_string(build(scene, numbers))
-    model.opt.timestep = DT / 10
-    data = mujoco.MjData(model)
-    start = [0.2, -0.3][: scene.n]
-    data.qpos[:] = start
-    commands = np.array([[0.3 * np.sin(0.02 * k + j) for j in range(model.nu)] for k in range(400)])
-    record, worst = run(scene, numbers, start, [0.0] * scene.n, 400, commands), 0.0
-    for k, command in enumerate(commands):
-        worst = max(worst, float(np.abs(data.qpos - record.q[k]).max()))
-        data.ctrl[:] = command
-        for _ in range(10):
-            mujoco.mj_step(model, data)
-    assert np.ptp(record.q, 0).min() > 0.01 and worst < 2e-5
+    record, worst = beside_mujoco(Stiff, name, 400)
+    assert np.ptp(record.q, 0).min() > 0.01 and worst.max() < 2e-5
 
 
 def test_a_free_pendulum_has_the_exact_period() -> None:
     scene, numbers = machine("pendulum", damping=[0.0])
-    record = run(scene, numbers, [1.0], [0.0], 1500)
+    record = run(Stiff, scene, numbers, [1.0], [0.0], 1500)
     m, c, i, armature = (numbers[k][0] for k in ("m", "c", "i", "armature"))
     period = 4 * np.sqrt((i + m * c * c + armature) / (m * 9.81 * c)) * ellipk(np.sin(0.5) ** 2)
     q = record.q[:, 0]
@@ -58,15 +31,10 @@ def test_a_free_pendulum_has_the_exact_period() -> None:
 
 def test_an_arm_without_friction_keeps_its_energy() -> None:
     scene, numbers = machine("arm", damping=[0.0, 0.0])
-    record = run(scene, numbers, [1.0, -0.5], [0.0, 0.0], 1000)
-    model = mujoco.MjModel.from_xml_string(build(scene, numbers))
-    model.opt.enableflags |= mujoco.mjtEnableBit.mjENBL_ENERGY
-    data, energy = mujoco.MjData(model), []
-    for k in (0, 400, 999):
-        data.qpos[:], data.qvel[:] = record.q[k], record.v[k]
-        mujoco.mj_forward(model, data)
-        energy.append(data.energy.sum())
-    assert np.ptp(energy) < 1e-4 * abs(energy[0])
+    record = run(Stiff, scene, numbers, [1.0, -0.5], [0.0, 0.0], 1000)
+    energy = energies(scene, numbers, record, (0, 400, 999))
+    total = energy.sum(1)
+    assert np.ptp(total) < 1e-4 * abs(total[0])
 
 
 def test_payload_and_tilt_mean_what_mujoco_means() -> None:
@@ -89,7 +57,7 @@ def test_payload_and_tilt_mean_what_mujoco_means() -> None:
 def test_dry_friction_holds_below_its_level_and_lets_go_above() -> None:
     scene, numbers = machine("slide", gear=[10.0], damping=[0.0])
     held, moving = (
-        run(scene, numbers, [0.1], [0.0], 500, np.full((500, 1), u), c_pos=5.0, c_neg=5.0) for u in (0.49, 0.6)
+        run(Stiff, scene, numbers, [0.1], [0.0], 500, np.full((500, 1), u), c_pos=5.0, c_neg=5.0) for u in (0.49, 0.6)
     )
     assert abs(held.q[-1, 0] - 0.1) < 3 * CREEP["slide"]  # [m] in 1 s
     mass = numbers["m"][0] + numbers["armature"][0]
@@ -99,7 +67,7 @@ def test_dry_friction_holds_below_its_level_and_lets_go_above() -> None:
 def test_a_sliding_table_stops_where_its_kinetic_energy_is_used_up() -> None:
     scene, numbers = machine("slide", damping=[0.0])
     mass = numbers["m"][0] + numbers["armature"][0]
-    record = run(scene, numbers, [0.0], [0.3], 1000, c_pos=2.0, c_neg=2.0)
+    record = run(Stiff, scene, numbers, [0.0], [0.3], 1000, c_pos=2.0, c_neg=2.0)
     assert record.q[-1, 0] == pytest.approx(0.5 * mass * 0.3**2 / 2.0, rel=1e-3)
     assert abs(record.v[-1, 0]) < CREEP["slide"]
 
@@ -107,14 +75,14 @@ def test_a_sliding_table_stops_where_its_kinetic_energy_is_used_up() -> None:
 def test_a_lag_is_exact_and_a_limit_holds() -> None:
     scene, numbers = machine("slide", gear=[10.0], damping=[0.0])
     commands = np.r_[np.zeros(1), np.ones(199)][:, None]
-    record = run(scene, numbers, [0.0], [0.0], 200, commands, lag=0.02)
+    record = run(Stiff, scene, numbers, [0.0], [0.0], 200, commands, lag=0.02)
     assert np.allclose(record.force[1:, 0], 10 * (1 - np.exp(-DT * np.arange(199) / 0.02)))
-    assert np.allclose(run(scene, numbers, [0.0], [0.0], 200, commands, limit=4.0).force[1:], 4.0)
+    assert np.allclose(run(Stiff, scene, numbers, [0.0], [0.0], 200, commands, limit=4.0).force[1:], 4.0)
 
 
 def test_a_rotor_crosses_the_play_alone() -> None:
     scene, numbers = machine("slide", gear=[10.0], damping=[0.0], armature=[1.0])
     p = {"elastic": 1.0, "gap": 1e-3, "stiffness": 4e6, "twist_damping": 1200.0}
-    record = run(scene, numbers, [0.0], [0.0], 60, np.full((60, 1), 0.1), **p)
+    record = run(Stiff, scene, numbers, [0.0], [0.0], 60, np.full((60, 1), 0.1), **p)
     touch = int(np.sqrt(2e-3) / DT)  # 1 N on 1 kg: 1 mm takes 45 ms
     assert np.all(record.q[: touch - 1, 0] == 0.0) and record.q[-1, 0] > 1e-5
