@@ -1,26 +1,30 @@
 """What each number in the judgement of `diagnose` is worth: the verdicts of a benchmark's cases without it.
 
-    python -m tools.studies.judgement CASES [--jobs 2] [--csv results/judgement/judgement.csv]
+    python -m tools.studies.judgement CASES [CASES ...] [--jobs 2] [--csv results/judgement/judgement.csv]
 
-CASES is a folder that `tools.studies.blind_benchmark --only generate` made, of a seed for development. Each case is
-searched once; then its sets are judged as they are, and once for each threshold with that threshold out of the way.
-The search keeps its own numbers. A row says how many answers were right, and how many differ from those as it is.
+CASES are folders that `tools.studies.blind_benchmark` or `tools.studies.foreign_benchmark` made with --only generate,
+of seeds for development. Each case is searched once; then its sets are judged as they are, and once for each threshold
+with that threshold out of the way. The search keeps its own numbers. A row says how many answers were right, and how
+many differ from those as it is, in one folder.
 """
 
 import argparse
-import csv
 import importlib
 import json
 import sys
-from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 from tqdm import tqdm
 
 from tools.studies.blind import cases, score
+from tools.studies.blind.solve import known
+from tools.studies.blind_benchmark import write_rows
+from tools.studies.foreign.score import fair
 
 
 class Threshold(NamedTuple):
@@ -67,71 +71,96 @@ def idle(threshold: Threshold | None) -> Iterator[None]:
 
 @contextmanager
 def search_once() -> Iterator[None]:
-    """Searches of the same case are done once: the n-th of a run gives what the n-th of the first run gave."""
+    """Searches of the same case are done once: the n-th of a run gives what the n-th of the first run gave.
+
+    So are the other fits that take long, of the same set.
+    """
     from mpc_sgft.diagnose import run
 
-    search, done = run.search, []
+    before = {name: getattr(run, name) for name in ("search", "run", "near_fit", "refit", "fit_residual_model")}
+    searched: list[tuple[Any, tuple[Any, ...]]] = []
+    fitted: dict[tuple[Any, ...], Any] = {}
+    calls = 0
 
-    def remembered(*args: Any, **kwargs: Any) -> Any:
+    def search(*args: Any, **kwargs: Any) -> Any:
         nonlocal calls
-        if calls == len(done):
-            setup, hypotheses = search(*args, **kwargs)
-            done.append((setup, tuple(hypotheses)))
-        setup, hypotheses = done[calls]
+        if calls == len(searched):
+            setup, hypotheses = before["search"](*args, **kwargs)
+            searched.append((setup, tuple(hypotheses)))
+        setup, hypotheses = searched[calls]
         calls += 1
         return setup, list(hypotheses)  # judging adds to it
 
-    def once_more(*args: Any, **kwargs: Any) -> Any:
+    def again(*args: Any, **kwargs: Any) -> Any:
         nonlocal calls
         calls = 0
-        return judged(*args, **kwargs)
+        return before["run"](*args, **kwargs)
 
-    calls, judged = 0, run.run
-    run.search = remembered
-    run.run = once_more
+    def near_fit(setup: Any, f: Any, plant: Any) -> Any:
+        return fitted_once((plant.model.opt.timestep, *_values(f)), lambda: before["near_fit"](setup, f, plant))
+
+    def refit(setup: Any, hypotheses: list[Any], near: Any) -> Any:
+        key = "refit", *(h.key for h in hypotheses), *_values(near.fit)
+        return list(fitted_once(key, lambda: before["refit"](setup, hypotheses, near)))
+
+    def fit_residual_model(setup: Any, best: Any, *args: Any) -> Any:
+        return fitted_once(("flexible", *_values(best.fit)), lambda: before["fit_residual_model"](setup, best, *args))
+
+    def fitted_once(key: tuple[Any, ...], fit: Callable[[], Any]) -> Any:
+        if key not in fitted:
+            fitted[key] = fit()
+        return fitted[key]
+
+    for f in (search, near_fit, refit, fit_residual_model):
+        setattr(run, f.__name__, f)
+    run.run = again
     try:
         yield
     finally:
-        run.search = search
-        run.run = judged
+        for name, f in before.items():
+            setattr(run, name, f)
+
+
+def _values(f: Any) -> tuple[Any, ...]:
+    """What tells one fit from another, to the last digit."""
+    return *(t.label for t in f.terms), *(v.tobytes() for v in f.values)
 
 
 def ablate(case: Path) -> dict[str, dict[str, Any]]:
     """Reports of one case by threshold, "" as it is."""
     from mpc_sgft.diagnose import diagnose
 
-    known, out = json.loads((case / "known.json").read_text()), {}
+    files, out = sorted(case.glob("episode_*.csv")), {}
     with search_once():
         for threshold in (None, *THRESHOLDS):
             with idle(threshold):
-                files = sorted(case.glob("episode_*.csv"))
-                report = diagnose(case / "model.xml", files, uncertain=known["uncertain"] or None, out=None)
+                report = diagnose(case / "model.xml", files, out=None, **known(case))
                 out[threshold.name if threshold else ""] = report.as_dict()
     return out
 
 
 def rows(found: dict[str, dict[str, dict[str, Any]]], labels: dict[str, dict[str, Any]]) -> list[dict[str, Any]]:
-    """One row a threshold."""
-    out = []
+    """One row a threshold: shares of right and of wrong answers, and of how many."""
+    out, fairly = [], {case: fair(labels[case]) for case in found}
     for name in ["", *(t.name for t in THRESHOLDS)]:
-        reports = {case: said[name] for case, said in found.items()}
         row: dict[str, Any] = {"without": name or "nothing"}
-        for s in score.table(reports, labels):
-            if s.count and s.name in COLUMNS:
-                row |= {COLUMNS[s.name]: round(s.value, 3), f"{COLUMNS[s.name]}_of": s.count}
-        row["verdicts_changed"] = sum(_said(reports[c]) != _said(found[c][""]) for c in reports)
+        for column, groups, count in COLUMNS:
+            counted = [count(found[c][name], y) for c, y in fairly.items() if y["group"] in groups]
+            values = np.hstack([np.empty(0), *counted])
+            row |= {column: round(float(values.mean()), 3) if len(values) else "", f"{column}_of": len(values)}
+        row["changed"] = sum(_said(said[name]) != _said(said[""]) for said in found.values())
         out.append(row)
     return out
 
 
-COLUMNS = {
-    "single, clear: top 1": "single",
-    "single, clear: named, no tie": "named",
-    "pairs: F1 of the set of names": "pairs_f1",
-    "no effect: false alarms": "false_alarms",
-    "outside the library: a wrong name": "wrong_outside",
-    "90 % intervals that cover the truth": "coverage",
-}
+COLUMNS: tuple[tuple[str, tuple[str, ...], Callable[..., Any]], ...] = (
+    ("single_exact", ("single",), score.top1),
+    ("pair_exact", ("pair",), score.top1),
+    ("f1", ("single", "pair"), score.f1),
+    ("false_alarms", ("none",), lambda said, label: bool(score.asserted(said))),
+    ("wrong_outside", ("outside",), lambda said, label: bool(score.asserted(said))),
+    ("coverage", ("single", "pair"), score.covered),
+)
 
 
 def _said(report: dict[str, Any]) -> tuple[str, list[str], list[list[str]]]:
@@ -140,34 +169,36 @@ def _said(report: dict[str, Any]) -> tuple[str, list[str], list[list[str]]]:
 
 def main(argv: list[str]) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("cases", type=Path, help="folder of generated cases")
+    parser.add_argument("cases", type=Path, nargs="+", help="folders of generated cases")
     parser.add_argument("--jobs", type=int, default=2, help="processes (default 2)")
     parser.add_argument("--csv", type=Path, default=Path("results/judgement/judgement.csv"))
     args = parser.parse_args(argv)
+    table = []
     try:
-        labels = cases.labels(args.cases)
+        hidden = {folder: cases.labels(folder) for folder in args.cases}
     except ValueError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    kept = args.cases / "judgement.jsonl"  # a case a line, so that a stopped run goes on
-    found = dict(map(json.loads, kept.read_text().splitlines())) if kept.is_file() else {}
-    todo = [args.cases / "cases" / name for name in labels if name not in found]
-    with ProcessPoolExecutor(args.jobs) as pool, kept.open("a") as file:
-        for case, said in zip(
-            todo, tqdm(pool.map(ablate, todo), total=len(todo), desc="judge", unit="case"), strict=True
-        ):
-            found[case.name] = said
-            file.write(json.dumps([case.name, said]) + "\n")
-            file.flush()
-    table = rows(found, labels)
-    args.csv.parent.mkdir(parents=True, exist_ok=True)
-    with args.csv.open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(table[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(table)
+    for folder, labels in hidden.items():
+        table += [{"cases": folder.name, **row} for row in rows(judged(folder, list(labels), args.jobs), labels)]
+        write_rows(args.csv, table)  # after each folder: they take long
     for row in table:
         print("  ".join(f"{k} {v}" for k, v in row.items()))
     return 0
+
+
+def judged(folder: Path, names: list[str], jobs: int) -> dict[str, dict[str, dict[str, Any]]]:
+    """Reports of a folder's cases by threshold; what is on disk is not done again."""
+    kept = folder / "judgement.jsonl"  # a case a line, so that a stopped run goes on
+    found = dict(map(json.loads, kept.read_text().splitlines())) if kept.is_file() else {}
+    todo = [name for name in names if name not in found]
+    with ProcessPoolExecutor(jobs) as pool, kept.open("a") as file:
+        futures = {pool.submit(ablate, folder / "cases" / name): name for name in todo}
+        for future in tqdm(as_completed(futures), total=len(todo), desc=f"judge {folder.name}", unit="case"):
+            found[futures[future]] = future.result()
+            file.write(json.dumps([futures[future], found[futures[future]]]) + "\n")
+            file.flush()
+    return {name: found[name] for name in names}
 
 
 if __name__ == "__main__":

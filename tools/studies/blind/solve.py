@@ -28,7 +28,6 @@ def solve(case: Path, out: Path, names: list[str] | None = None, seed: int = 0) 
     from mpc_sgft.diagnose import diagnose
 
     out.mkdir(parents=True, exist_ok=True)
-    known = json.loads((case / "known.json").read_text())
     began = time.perf_counter()
     try:
         report = diagnose(
@@ -39,10 +38,9 @@ def solve(case: Path, out: Path, names: list[str] | None = None, seed: int = 0) 
             signals=None,
             window=None,
             held_out=None,
-            uncertain=known["uncertain"] or None,
             seed=seed,
             max_effects=len(names) if names else 3,
-            tolerance=known.get("tolerance"),
+            **known(case),
         ).as_dict()
     except Exception as error:  # a crash is a result of the benchmark, with its trace beside it
         (out / "traceback.txt").write_text(traceback.format_exc())
@@ -52,6 +50,12 @@ def solve(case: Path, out: Path, names: list[str] | None = None, seed: int = 0) 
     partial.write_text(json.dumps(report))
     partial.rename(out / "blind.json")  # complete or absent, so that a killed run resumes
     return report
+
+
+def known(case: Path) -> dict[str, Any]:
+    """What the user of a case knows, as arguments of `diagnose`."""
+    said = json.loads((case / "known.json").read_text())
+    return {"uncertain": said["uncertain"] or None, "tolerance": said.get("tolerance")}
 
 
 def solve_all(
