@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -138,7 +139,12 @@ def _inspect(args: argparse.Namespace) -> int:
             f"--{others[0].replace('_', '-')} does not go with --inspect, which only looks: --inspect RECORDINGS, with "
             "--model and --map if you like."
         )
-    print(inspect(args.inspect, None if args.model is None else load_plant(args.model), _mapping(args.map)))
+    found = inspect(args.inspect, None if args.model is None else load_plant(args.model), _mapping(args.map))
+    try:
+        print(found, flush=True)
+    except BrokenPipeError:  # `| head` has read enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for what is still to be flushed
+        return 141  # as a shell says it of a process that SIGPIPE ended
     return 0
 
 

@@ -17,6 +17,7 @@ from mpc_sgft.diagnose.candidates.suspects import gap_of, suspects
 from mpc_sgft.diagnose.data.check import check_settings
 from mpc_sgft.diagnose.data.measured import Array
 from mpc_sgft.diagnose.deployments.chain import Chain, Prediction, effects_of
+from mpc_sgft.diagnose.deployments.missing import missing
 from mpc_sgft.diagnose.deployments.motion_link import JOINT_SAMPLES
 from mpc_sgft.diagnose.deployments.next_recording import next_experiment
 from mpc_sgft.diagnose.deployments.recordings import Deployment, read_deployment
@@ -173,7 +174,7 @@ def assemble(
         "effects": effect_rows(setup, verdict, hypotheses, rows) if shown else [],
         "traces": trace_rows(setup, verdict, hypotheses, rows),
         "candidates": candidate_rows(hypotheses, best, verdict, rng),
-        "waterfall": waterfall(setup, verdict, hypotheses, rows, seen(chain.observed, chain.drive)),
+        "waterfall": waterfall(setup, verdict, hypotheses, rows, seen(chain.observed, chain.drive), signals),
         "ties": [
             {"effects": e.names, "probability": verdict.probability[e.key], "held_out_error": e.error, "reason": reason}
             for e, reason in verdict.ties
@@ -195,7 +196,7 @@ def assemble(
     }
     measured = seen(chain.observed, chain.drive)
     nominal, repaired = seen(both.observation, both.drive)
-    return Report(data, measured, nominal, repaired, replayer_view(chain))
+    return Report(data, measured, nominal, repaired, replayer_view(chain), missing(chain, both, bool(held.effects)))
 
 
 def errors_of(chain: Chain, y: Prediction) -> Array:

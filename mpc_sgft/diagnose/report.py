@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from mpc_sgft.diagnose.data.measured import Array
-from mpc_sgft.diagnose.page.laws import Law
+from mpc_sgft.diagnose.page.laws import Laws
 from mpc_sgft.diagnose.page.page import Lines, page
 from mpc_sgft.diagnose.page.words import changes, headline, place
 from mpc_sgft.diagnose.simulation.replay import Replayer
@@ -25,7 +24,7 @@ class Report:
         data: The keys of report.json.
         measured, nominal, repaired: Signals of all windows for plots, [W, n, S].
         replayer: Windows and signal names.
-        laws: What force is missing, along what.
+        laws: What is missing, along what.
         diff: From the nominal scene to the repaired one; empty if nothing was written.
     """
 
@@ -34,7 +33,7 @@ class Report:
     nominal: Array = field(repr=False)
     repaired: Array = field(repr=False)
     replayer: Replayer = field(repr=False)
-    laws: Sequence[Law] = ()
+    laws: Laws = Laws()  # noqa: RUF009, it is a tuple
     diff: str = ""
 
     @property

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -80,11 +80,24 @@ def _row(s: Relevance, value: Array, change: Array, shown: Shown) -> dict[str, A
 
 
 def waterfall(
-    setup: Setup[Any], verdict: Verdict, hypotheses: list[Hypothesis], shown: Shown, measured: Array
+    setup: Setup[Any],
+    verdict: Verdict,
+    hypotheses: list[Hypothesis],
+    shown: Shown,
+    measured: Array,
+    worst: Sequence[Mapping[str, Any]],
 ) -> list[dict[str, Any]]:
-    """Error of the worst signal on windows that were never fitted, as effects join the model, up to the noise.
+    """Error of a signal on windows that were never fitted, as effects join the model, up to the noise.
 
-    Those that would be missed most join first; `measured` is [W, n, S].
+    Those that would be missed most join first.
+
+    Args:
+        setup: Problem and baseline.
+        verdict: The answer.
+        hypotheses: All that were fitted.
+        shown: Predictions and signals.
+        measured: [W, n, S].
+        worst: Rows of `reduction`, the worst signal first: the first of those shown is drawn.
     """
     sets, e, told = [], verdict.best, foretold(setup, verdict.there)
     while e.effects:
@@ -96,16 +109,12 @@ def waterfall(
     if verdict.traces:
         sets.append(verdict.there)
         names.append("traces")
-    y = shown.predict([e.fit for e in sets])
-    errors = np.sqrt(((y - measured) ** 2)[:, setup.held].mean((1, 2)))  # [K, S]
-    noise = np.asarray(setup.noise[: errors.shape[1]])
-    worst = int(np.argmax(errors[0] / np.maximum(noise, 1e-12)))
-    signal, unit = list(shown.signals.items())[worst]
-    values = [*errors[:, worst], noise[worst]]
-    return [
-        {"what": what, "signal": signal, "unit": unit, "rms": float(x)}
-        for what, x in zip([*names, "noise"], values, strict=True)
-    ]
+    signal = next(row["signal"] for row in worst if row["signal"] in shown.signals)
+    i = list(shown.signals).index(signal)
+    y = shown.predict([e.fit for e in sets])[..., i]
+    errors = np.sqrt(((y - measured[..., i]) ** 2)[:, setup.held].mean((1, 2)))  # [K]
+    steps = zip([*names, "noise"], [*errors, np.hypot(setup.noise[i], setup.floor[i])], strict=True)
+    return [{"what": what, "signal": signal, "unit": shown.signals[signal], "rms": float(x)} for what, x in steps]
 
 
 def _added(small: Hypothesis, large: Hypothesis) -> str:

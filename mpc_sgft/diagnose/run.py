@@ -25,7 +25,7 @@ from mpc_sgft.diagnose.fitting.prepare import Setup, near_fit, prepare, typical_
 from mpc_sgft.diagnose.fitting.residual_model import fit_residual_model
 from mpc_sgft.diagnose.fitting.screening import key_of
 from mpc_sgft.diagnose.fitting.search import nearest, refit, search
-from mpc_sgft.diagnose.page.laws import laws
+from mpc_sgft.diagnose.page.laws import missing_forces
 from mpc_sgft.diagnose.report import Report
 from mpc_sgft.diagnose.rows import Shown, candidate_rows, effect_rows, reduction, trace_rows, waterfall
 from mpc_sgft.diagnose.simulation.plant import SHARP, Change, Plant, driven, joint_of
@@ -200,7 +200,7 @@ def assemble(
         "effects": effect_rows(setup, verdict, hypotheses, rows) if shown else [],
         "traces": trace_rows(setup, verdict, hypotheses, rows),
         "candidates": candidate_rows(hypotheses, best, verdict, rng),
-        "waterfall": waterfall(setup, verdict, hypotheses, rows, measured),
+        "waterfall": waterfall(setup, verdict, hypotheses, rows, measured, signals),
         "ties": ties,
         "next_experiment": next_experiment(setup, tied) if len(tied) > 1 else "",
         "nominal_refit": refit_table(list(base.terms), list(best.fit.values[: len(base.terms)])),
@@ -217,7 +217,7 @@ def assemble(
         "effects_file": None,
         "notes": notes,
     }
-    return Report(data, measured, nominal, repaired, replayer, laws(setup, held.fit))
+    return Report(data, measured, nominal, repaired, replayer, missing_forces(setup, held.fit))
 
 
 def _signals(

@@ -14,6 +14,7 @@ import numpy as np
 from mpc_sgft.diagnose.data.measured import Array
 
 LEFT, RIGHT, TOP, BOTTOM = 62, 12, 10, 38  # margins of the plot
+FEW = 200  # dots
 
 
 class Chart:
@@ -71,9 +72,10 @@ class Chart:
         self.inside.append(f'<path class="line {kind}" d="{d}"/>')
 
     def dots(self, x: Array, y: Array, kind: str) -> None:
-        """Points [n], as one path of strokes without length."""
+        """Points [n], as one path of strokes without length; larger where there are few."""
+        few = " few" if len(x) < FEW else ""
         d = "".join(f"M{a:.1f} {b:.1f}h0" for a, b in zip(self.px(x), self.py(y), strict=True))
-        self.inside.append(f'<path class="dots {kind}" d="{d}"/>')
+        self.inside.append(f'<path class="dots {kind}{few}" d="{d}"/>')
 
     def bar(self, row: int, rows: int, value: float, kind: str, name: str, told: str) -> None:
         """A horizontal bar from the axis to a value, named at its left and told at its end."""

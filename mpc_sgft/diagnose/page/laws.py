@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -16,27 +17,38 @@ MOST = 6  # joints that are drawn
 
 
 class Law(NamedTuple):
-    """Of one joint: what force is missing, and along what.
+    """What is missing, against what it may depend on.
 
     Attributes:
-        joint: Its name.
-        slide: Whether it slides, with forces in N.
-        position, speed: [M] rad or m, rad/s or m/s.
-        command: Of the actuator that drives it, [M]; None where none does or it never changes.
-        before: Missing force of the nominal model, [M] N m or N.
-        after: Of the repaired one; None where what was found is no force, or nothing was.
+        where: The joint or signal.
+        missing: What of it, with its unit.
+        along: Labels with units, and values, each [M].
+        before: What the nominal model misses, [M].
+        after: What the repaired one misses; None where that cannot be said, or nothing was found.
     """
 
-    joint: str
-    slide: bool
-    position: Array
-    speed: Array
-    command: Array | None
+    where: str
+    missing: str
+    along: Sequence[tuple[str, Array]]
     before: Array
     after: Array | None
 
 
-def laws(setup: Setup, repaired: Fit) -> list[Law]:
+class Laws(NamedTuple):
+    """A section of the page: what is drawn, how to read it, and what there is to draw."""
+
+    title: str = ""
+    reading: str = ""
+    laws: Sequence[Law] = ()
+
+
+FORCE = (
+    "What the measured motion needs and the model does not give, by inverse dynamics of the smoothed recording. "
+    "Friction shows against speed, springs and loads against position, gains and dead bands against the command."
+)
+
+
+def missing_forces(setup: Setup, repaired: Fit) -> Laws:
     """Of the joints that miss most of their force, largest first."""
     plant = setup.problem.replayer.plant
     before, q, v, u = missing_force(setup)
@@ -48,10 +60,11 @@ def laws(setup: Setup, repaired: Fit) -> list[Law]:
             after = missing_force(setup, repaired)[0]
     drives = {joint: i for i, a in enumerate(plant.actuators) if (joint := joint_of(plant, a))}
     out = []
-    for j, joint in enumerate(plant.joints):
-        command = u[:, drives[joint]] if joint in drives else None
-        if command is not None and not np.ptp(command):
-            command = None
-        left = None if after is None else after[:, j]
-        out.append(Law(joint, plant.axes()[joint].slide, q[:, j], v[:, j], command, before[:, j], left))
-    return sorted(out, key=lambda law: -float(np.median(np.abs(law.before))))[:MOST]
+    for j in np.argsort(-np.median(np.abs(before), 0))[:MOST]:
+        joint = plant.joints[j]
+        force, place, speed = ("N", "m", "m/s") if plant.axes()[joint].slide else ("N m", "rad", "rad/s")
+        along = [(f"speed [{speed}]", v[:, j]), (f"position [{place}]", q[:, j])]
+        if joint in drives and np.ptp(u[:, drives[joint]]):
+            along.append(("command", u[:, drives[joint]]))
+        out.append(Law(joint, f"missing force [{force}]", along, before[:, j], None if after is None else after[:, j]))
+    return Laws("The force that is missing", FORCE, out)

@@ -10,7 +10,7 @@ import numpy as np
 
 from mpc_sgft.diagnose.data.measured import Array
 from mpc_sgft.diagnose.page.charts import BOTTOM, TOP, Chart, span, thinned
-from mpc_sgft.diagnose.page.laws import Law
+from mpc_sgft.diagnose.page.laws import Laws
 from mpc_sgft.diagnose.page.style import CSS, SCRIPT
 from mpc_sgft.diagnose.page.words import changes, headline, sentence
 
@@ -39,8 +39,8 @@ class Lines(NamedTuple):
     repaired: Array
 
 
-def page(d: Mapping[str, Any], lines: Lines, laws: Sequence[Law], diff: str) -> str:
-    """One self-contained HTML page of a report.json, signals, what force is missing, and the scene's change."""
+def page(d: Mapping[str, Any], lines: Lines, laws: Laws, diff: str) -> str:
+    """One self-contained HTML page of a report.json, signals, what is missing, and the scene's change."""
     sections = [
         _head(d),
         _waterfall(d),
@@ -80,10 +80,10 @@ def _head(d: Mapping[str, Any]) -> str:
 
 
 def _waterfall(d: Mapping[str, Any]) -> str:
-    steps = d["waterfall"]
+    steps = [s for s in d["waterfall"] if s["rms"] > 0]
     if not steps:
         return ""
-    values = [max(s["rms"], 1e-300) for s in steps]
+    values = [s["rms"] for s in steps]
     unit, signal = steps[0]["unit"], steps[0]["signal"]
     low, high = min(values) / 2, max(values) * 1.3
     chart = Chart(
@@ -101,42 +101,27 @@ def _waterfall(d: Mapping[str, Any]) -> str:
         chart.bar(i, len(steps), v, kinds.get(s["what"], "best"), _short(s["what"], 36), f"{v:.3g}")
     return (
         "<h2>From the nominal model to the noise</h2><p>Root mean square error on windows that were never fitted, as "
-        "effects join the model one after the other. Each step is fitted anew.</p>"
+        "effects join the model one after the other. Each step is fitted anew. Noise is the sensor's and what the "
+        "simulator cannot tell.</p>"
         f"<figure>{chart.svg('error by effects in the model', y_ticks=False)}</figure>"
     )
 
 
-def _laws(laws: Sequence[Law]) -> str:
-    if not laws:
-        return ""
+def _laws(laws: Laws) -> str:
     rows = []
-    for law in laws:
-        force, place_, speed = ("N", "m", "m/s") if law.slide else ("N m", "rad", "rad/s")
-        along: list[tuple[str, Array | None]] = [
-            (f"speed [{speed}]", law.speed),
-            (f"position [{place_}]", law.position),
-            ("command", law.command),
-        ]
-        charts = []
-        for label, x in along:
-            if x is None:
-                continue
-            pick = list(thinned(len(x), DOTS))
-            shown = [law.before] if law.after is None else [law.before, law.after]
-            chart = Chart(380, 250, span(x), span(*shown, trim=TRIM), (label, f"missing force [{force}]"))
-            chart.dots(x[pick], law.before[pick], "nominal")
-            if law.after is not None:
-                chart.dots(x[pick], law.after[pick], "repaired")
-            charts.append(chart.svg(f"missing force of {law.joint} against {label}"))
+    for law in laws.laws:
+        charts, pick = [], list(thinned(len(law.before), DOTS))
+        shown = [law.before] if law.after is None else [law.before, law.after]
+        for label, x in law.along:
+            chart = Chart(380, 250, span(x), span(*shown, trim=TRIM), (label, law.missing))
+            for kind, y in zip(("nominal", "repaired"), shown, strict=False):
+                chart.dots(x[pick], y[pick], kind)
+            charts.append(chart.svg(f"{law.missing} of {law.where} against {label}"))
         rows.append(
-            f"<figure><figcaption>{_e(law.joint)}</figcaption><div class='pair'>{''.join(charts)}</div></figure>"
+            f"<figure><figcaption>{_e(law.where)}</figcaption><div class='pair'>{''.join(charts)}</div></figure>"
         )
-    keys = _keys(("nominal", "repaired") if any(law.after is not None for law in laws) else ("nominal",))
-    return (
-        "<h2>The force that is missing</h2><p>What the measured motion needs and the model does not give, by inverse "
-        "dynamics of the smoothed recording. Friction shows against speed, springs and loads against position, gains "
-        f"and dead bands against the command.</p><p>{keys}</p>{''.join(rows)}"
-    )
+    keys = _keys(("nominal", "repaired") if any(law.after is not None for law in laws.laws) else ("nominal",))
+    return f"<h2>{_e(laws.title)}</h2><p>{_e(laws.reading)}</p><p>{keys}</p>{''.join(rows)}" if rows else ""
 
 
 def _signals(d: Mapping[str, Any], lines: Lines) -> str:
@@ -158,7 +143,8 @@ def _signals(d: Mapping[str, Any], lines: Lines) -> str:
     return (
         "<h2>Measured, nominal, repaired</h2><p>Short windows, each from its measured start. Drag across a chart to "
         f"look closer, double-click for all of it.</p><p>{_keys(SERIES)}</p>{''.join(figures)}"
-        "<p class='soft'>The same in the viewer, with all signals in step: <code>rerun report.rrd</code></p>"
+        "<p class='soft'>The same in the viewer, with all signals in step: <a href='report.rrd'>report.rrd</a>, or "
+        "<code id='view'>rerun report.rrd</code> <button data-copy='view'>copy</button></p>"
     )
 
 

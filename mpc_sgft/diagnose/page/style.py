@@ -13,10 +13,12 @@ p{margin:.3rem 0 .7rem;max-width:46rem}.soft,figcaption{color:var(--soft);font-s
 .tag{display:inline-block;font-size:.8rem;padding:.1rem .55rem;border:1px solid var(--edge);border-radius:1rem}
 figure{margin:.8rem 0;background:var(--card);border:1px solid var(--edge);border-radius:.5rem;padding:.6rem}
 .pair{display:grid;grid-template-columns:repeat(auto-fit,minmax(min(100%,19rem),1fr));gap:.6rem}
+.pair svg{max-width:38rem}
 figure{overflow-x:auto}svg{display:block;width:100%;height:auto}figure>svg{min-width:36rem}
 text{fill:var(--soft);font:11.5px system-ui,sans-serif}
 .grid{stroke:var(--edge);stroke-width:.6;fill:none}.line{fill:none;stroke-width:1.3;vector-effect:non-scaling-stroke}
 .dots{fill:none;stroke-width:2.4;stroke-linecap:round;stroke-opacity:.5;vector-effect:non-scaling-stroke}
+.few{stroke-width:5;stroke-opacity:.8}
 .measured{stroke:var(--measured)}.nominal{stroke:var(--nominal)}.repaired{stroke:var(--repaired)}
 .bar{stroke:none;fill:var(--soft);fill-opacity:.55}.bar.best{fill:var(--best);fill-opacity:.85}
 .bar.nominal{fill:var(--nominal);fill-opacity:.85}.bar.trace{fill:var(--trace);fill-opacity:.85}

@@ -38,15 +38,34 @@ def test_a_turned_and_weak_machine_is_named_and_repaired(deployed, tmp_path: Pat
     mujoco.MjModel.from_xml_path(str(out / "repaired.xml"))
     assert any("MJCF cannot carry it" in note for note in report["notes"])
     assert json.loads((out / "report.json").read_text()) == json.loads(json.dumps(report))
-    assert "<svg viewBox=" in (out / "report.html").read_text() and (out / "report.rrd").stat().st_size > 1000
+    page = (out / "report.html").read_text()
+    assert "missing change of drive/" in page and "e-300" not in page, "the noise of a drive is not known"
+    assert (out / "report.rrd").stat().st_size > 1000
 
 
 def test_ice_is_named_by_how_far_the_puck_slides(deployed) -> None:
     run = deployed({"contact_friction": {"coefficient": 0.05, "at": ["puck"]}}, episodes=5)
-    report = diagnose_run(run, effects=["actuator_gain", "contact_friction"]).as_dict()
+    found = diagnose_run(run, effects=["actuator_gain", "contact_friction"])
+    report = found.as_dict()
     (effect,) = report["effects"]
     assert report["verdict"] == "effect" and effect["name"] == "contact_friction", report["reason"]
     assert abs(effect["parameters"]["coefficient"]["value"] - 0.05) < 0.02
+    puck = next(law for law in found.laws.laws if law.where == "observation/puck_x")
+    ((_, went),) = puck.along
+    assert np.polyfit(went, puck.before, 1)[0] > 0.1 > abs(np.polyfit(went, puck.after, 1)[0])  # further than foretold
+    assert not any(law.where.startswith("drive") for law in found.laws.laws), "commands reach the servos as they are"
+
+
+def test_a_weak_drive_shows_as_a_slope_over_the_command(deployed) -> None:
+    found = diagnose_run(deployed({"actuator_gain": {"gain": 0.7}}), effects=["actuator_gain"])
+    law = found.laws.laws[0]
+    now, last = law.along
+    assert law.where.startswith("drive/") and [now[0], last[0]] == [
+        "commanded change",
+        "commanded change, a step before",
+    ]
+    assert np.polyfit(now[1], law.before, 1)[0] == pytest.approx(-0.3, abs=0.25)  # the arm stands elsewhere, too
+    assert law.after is not None and np.std(law.after) < 0.05 * np.std(law.before)
 
 
 def test_a_right_simulator_has_no_effect(deployed, check_report) -> None:

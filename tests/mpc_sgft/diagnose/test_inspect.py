@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
+from subprocess import PIPE
 
 import numpy as np
 import pytest
@@ -74,3 +77,12 @@ def test_little_motion_is_said(moved: Callable, slide: Path, tmp_path: Path) -> 
     columns["time"][5] = columns["time"][4]
     write_csv(tmp_path / "still.csv", columns)
     assert "time does not always increase" in inspect([tmp_path / "still.csv"])
+
+
+def test_a_reader_that_left_is_no_traceback(foreign: Path) -> None:
+    process = subprocess.Popen(
+        [sys.executable, "-m", "mpc_sgft.diagnose", "--inspect", str(foreign)], stdout=PIPE, stderr=PIPE, text=True
+    )
+    assert process.stdout is not None and process.stderr is not None
+    process.stdout.close()
+    assert process.stderr.read() == "" and process.wait(60) == 141

@@ -85,10 +85,12 @@ def test_no_error_and_no_sideways_scroll_in_a_browser(width: int, report: Path, 
 def test_the_missing_force_of_dry_friction_is_a_step_and_the_repair_takes_it_away(
     slide: Path, record: Callable[..., Path]
 ) -> None:
-    (law,) = diagnose(slide, [record(coulomb=2.0)], effects=["coulomb_friction"]).laws
-    assert law.joint == "x" and law.slide and law.command is not None and law.after is not None
+    (law,) = diagnose(slide, [record(coulomb=2.0)], effects=["coulomb_friction"]).laws.laws
+    along = dict(law.along)
+    assert law.where == "x" and law.missing == "missing force [N]" and law.after is not None
+    assert [*along] == ["speed [m/s]", "position [m]", "command"]
     for direction in (-1, 1):
-        moving = direction * law.speed > 0.2
+        moving = direction * along["speed [m/s]"] > 0.2
         assert np.median(law.before[moving]) == pytest.approx(-2.0 * direction, abs=0.4)  # smoothed over 0.3 s
         assert abs(np.median(law.after[moving])) < 0.4
 
