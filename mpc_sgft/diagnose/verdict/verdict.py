@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -61,7 +62,7 @@ def reach_verdict(
     best, traces = what_matters(setup, there, hypotheses, rng, tolerance)
     if tolerance.allows(base.fit):
         traces, best = [*shares_of(setup, best, there, hypotheses, rng), *traces], base
-    probability = dict.fromkeys((e.key for e in hypotheses), 0.0)
+    probability: defaultdict[frozenset[str], float] = defaultdict(float)  # of sets that are fitted later, too
     rivals = [e for e in hypotheses if e.complexity <= 1 or no_larger(e, best)]  # larger sets are no more credible
     wins = judge.win_shares(
         np.array([e.errors for e in rivals]), np.array([e.complexity for e in rivals]), rng, setup.problem.blocks

@@ -272,6 +272,7 @@ def test_names_that_leave_much_of_an_error_are_no_answer(before: float, after: f
     named = judge_fit(setup, fit(problem, [term("a")], [np.ones(1)], fitted))._replace(errors=np.log1p(after) + scatter)
     verdict = reach_verdict(setup, [base, named], None, np.random.default_rng(0), motion(problem))
     assert verdict.kind == kind
+    assert verdict.probability[frozenset({"b"})] == 0, "a set that is only fitted to tell shares has won nothing"
 
 
 @pytest.mark.parametrize(
