@@ -78,16 +78,38 @@ def prune(setup: Setup[Any], best: Hypothesis, hypotheses: list[Hypothesis], rng
 
 
 def find_ties(
-    setup: Setup[Any], best: Hypothesis, hypotheses: list[Hypothesis], rng: np.random.Generator
+    setup: Setup[Any], best: Hypothesis, there: Hypothesis, hypotheses: list[Hypothesis], rng: np.random.Generator
 ) -> list[Hypothesis]:
     """Other sets of no more names and parameters than the best that are not credibly worse, best first.
 
-    Not those that hold the best, and can do all that it does: a richer effect must gain something.
+    Not those that hold the best, and can do all that it does: a richer effect must gain something. Nor those that are
+    credibly worse with all that is there beside what matters: what the best leaves out makes a rival look as good.
+
+    Args:
+        setup: Problem and baseline.
+        best: The set of what matters.
+        there: The set of all that is there.
+        hypotheses: All that were fitted.
+        rng: For the bootstrap.
     """
     rivals = [e for e in hypotheses if 0 < e.effects <= best.effects and 0 < e.complexity and no_larger(e, best)]
     other = [e for e in rivals if sorted(e.names) != sorted(best.names) and not holds(e, best)]
-    tied = [e for e in other if not judge.ruled_out(e.errors, best.errors, rng, log_odds(setup, best, e))]
-    return sorted(tied, key=lambda e: e.error)
+    pairs = [(e, e, best) for e in other] + [(e, with_all(e, best, there, hypotheses), there) for e in other]
+    worse = [
+        e
+        for e, rival, against in pairs
+        if rival and judge.ruled_out(rival.errors, against.errors, rng, log_odds(setup, against, rival))
+    ]
+    return sorted((e for e in other if not any(e is w for w in worse)), key=lambda e: e.error)
+
+
+def with_all(e: Hypothesis, best: Hypothesis, there: Hypothesis, hypotheses: list[Hypothesis]) -> Hypothesis | None:
+    """A rival of the best with what `there` has beside or in place of what is in both; None if it was not fitted."""
+    left_out, instead = {*there.names} - {*best.names}, {*best.names} - {*there.names}
+    if not left_out or not instead <= {*e.names}:
+        return None
+    names = sorted(({*e.names} - instead) | left_out)
+    return min((h for h in hypotheses if sorted(h.names) == names), key=lambda h: h.error, default=None)
 
 
 def as_given(setup: Setup[Any], best: Hypothesis, ties: list[Hypothesis]) -> tuple[Hypothesis, list[Hypothesis]]:

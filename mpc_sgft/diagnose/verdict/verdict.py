@@ -68,7 +68,7 @@ def reach_verdict(
         np.array([e.errors for e in rivals]), np.array([e.complexity for e in rivals]), rng, setup.problem.blocks
     )
     probability |= {e.key: float(s) for e, s in zip(rivals, wins, strict=True)}
-    best, ties = as_given(setup, best, find_ties(setup, best, hypotheses, rng))
+    best, ties = as_given(setup, best, find_ties(setup, best, there, hypotheses, rng))
     declared = [(e, equivalence(best, e)) for e in ties]
     kind, reason = _no_name(setup, there, best, base, residual_model, rng, tolerance)
     if kind:

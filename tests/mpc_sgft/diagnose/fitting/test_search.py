@@ -20,7 +20,7 @@ from mpc_sgft.diagnose.fitting.residual_model import ResidualModel
 from mpc_sgft.diagnose.fitting.screening import Effort
 from mpc_sgft.diagnose.fitting.search import no_worse, search, swaps
 from mpc_sgft.diagnose.simulation.plant import Change, Plant
-from mpc_sgft.diagnose.verdict.naming import gains
+from mpc_sgft.diagnose.verdict.naming import find_ties, gains
 from mpc_sgft.diagnose.verdict.tolerance import Tolerance
 from mpc_sgft.diagnose.verdict.verdict import reach_verdict
 
@@ -398,3 +398,18 @@ def test_an_error_beyond_the_tolerance_that_no_name_explains_is_unknown(limit: f
     allowed = motion(problem, limit, asked)
     verdict = reach_verdict(setup, [judge_fit(setup, setup.baseline), wrong], None, rng, allowed)
     assert verdict.kind == kind, verdict.reason
+
+
+def test_a_rival_that_is_worse_with_the_traces_in_it_does_not_tie() -> None:
+    problem, fitted, none, rng = Lines(), np.arange(18), np.zeros(1), np.random.default_rng(0)
+    setup = Setup(problem, fitted, np.arange(18, 24), fitted // 3, fit(problem, [], [], fitted), none, none, np.log1p)
+
+    def judged(names: str, error: float) -> Hypothesis:
+        h = judge_fit(setup, fit(problem, [term(n) for n in names], [np.ones(1)] * len(names), fitted))
+        return h._replace(errors=error + 0.01 * np.random.default_rng(len(names)).normal(size=24))
+
+    best, rival, there, worse = judged("a", 1.3), judged("b", 1.25), judged("ac", 0.9), judged("bc", 1.1)
+    assert find_ties(setup, best, best, [best, rival, there, worse], rng) == [rival]
+    assert find_ties(setup, best, there, [best, rival, there], rng) == [rival], "nobody has looked"
+    assert find_ties(setup, best, there, [best, rival, there, worse], rng) == []
+    assert find_ties(setup, best, there, [best, rival, there, worse._replace(errors=there.errors)], rng) == [rival]
