@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -13,6 +14,7 @@ import numpy as np
 import yaml
 
 from envs.effects.base import Effect
+from mpc_sgft.diagnose.candidates.library import Term
 from mpc_sgft.diagnose.candidates.suspects import gap_of, suspects
 from mpc_sgft.diagnose.data.check import check_settings
 from mpc_sgft.diagnose.data.measured import Array
@@ -36,6 +38,7 @@ from mpc_sgft.storage.metrics import progress as bar_of
 
 LENGTH = 6  # control steps in a window
 MOST = 64  # windows
+ASTRAY = 4.0  # mean square of a joint's error, in units of what noise and contacts make: that joint is suspected alone
 UNITS = {"observation": "of the observation", "drive": "of the control", "qpos": "rad"}
 EFFORT = Effort(
     beam=(2,), full=(5, 4, 3), screen_windows=16, quick_windows=16, enough=1.0, pairs=0, exchange=0, most=1000
@@ -77,7 +80,8 @@ def diagnose_run(
     deployment = read_deployment(run)
     setup = prepare(deployment, window, held_out)
     tolerated = tolerance_of(setup, tolerance)
-    terms = [s.term() for s in suspects(deployment.task, effects)]
+    lost = astray(setup.problem)
+    terms = [s.term() for s in suspects(deployment.task, effects, lost)]
     with bar_of(100, desc="diagnose", unit="%", disable=not progress) as bar:
 
         def show(what: str, share: float) -> None:
@@ -86,6 +90,11 @@ def diagnose_run(
 
         setup, hypotheses = search(setup, terms, max_effects, rng, show, EFFORT)
         verdict = reach_verdict(setup, hypotheses, None, rng, tolerated)
+        if verdict.kind == "none" and lost and not (verdict.there.effects or tolerated.allows(setup.baseline)):
+            reason = (
+                f"{', '.join(lost)}: the measured forces move it otherwise than foretold, and no name explains that"
+            )
+            verdict = verdict._replace(kind="unknown", reason=reason)
         bar.update(100 - bar.n)
     notes = list(deployment.notes)
     if len(deployment.episodes) == 1:
@@ -119,6 +128,14 @@ def prepare(deployment: Deployment, window: float | None, held_out: float | Sequ
     )
     noise = np.concatenate([chain.noise, np.zeros(len(floor) - len(chain.noise))])
     return Setup(chain, fitted, held, blocks, fit(chain, [], [], fitted), noise, floor, np.log1p)
+
+
+def astray(chain: Chain) -> list[str]:
+    """Joints that the measured drives move otherwise than foretold, by more than noise and contacts can tell."""
+    everything = np.arange(len(chain.windows.start))
+    misses = (chain.predict([()], everything).joints[0] / chain.joint_scale) ** 2  # [W, n J, nj]
+    worse = misses.mean((0, 1)) > ASTRAY
+    return [name.removeprefix("qpos/") for name, x in zip(chain.groups["qpos"], worse, strict=True) if x]
 
 
 def tolerance_of(setup: Setup[Chain], tolerance: float | Mapping[str, float | str] | None) -> Tolerance:
@@ -167,7 +184,8 @@ def assemble(
     tied = [best, *(e for e, _ in verdict.ties)]
     names = [n for group in chain.groups.values() for n in group]
     signals = held_out_rows(chain, both, setup, rng)
-    rows = Shown(_predict(chain), {n: UNITS[n.split("/")[0]] for n in signal_names(chain)})
+    units = {n: UNITS[n.split("/")[0]] for n in signal_names(chain)}
+    rows = Shown(_predict(chain), units, partial(unit_at, chain.motion.model))
     data: dict[str, Any] = {
         "verdict": verdict.kind,
         "reason": verdict.reason,
@@ -197,6 +215,18 @@ def assemble(
     measured = seen(chain.observed, chain.drive)
     nominal, repaired = seen(both.observation, both.drive)
     return Report(data, measured, nominal, repaired, replayer_view(chain), missing(chain, both, bool(held.effects)))
+
+
+def unit_at(model: mujoco.MjModel, term: Term, unit: str) -> str:
+    """Of "N m or N", the one that belongs to the joints at which an effect is; both where they differ."""
+    turning, _, sliding = unit.partition(" or ")
+    joints = {model.joint(i).name: int(model.jnt_type[i]) for i in range(model.njnt)}
+    kinds = {joints[name] for name in term.at if name in joints} or {
+        joints[model.joint(int(i)).name] for i in model.actuator_trnid[:, 0]
+    }
+    if not sliding or len(kinds) > 1:
+        return unit
+    return sliding if kinds == {int(mujoco.mjtJoint.mjJNT_SLIDE)} else turning
 
 
 def errors_of(chain: Chain, y: Prediction) -> Array:

@@ -1,7 +1,8 @@
 """What may be missing in a task's simulation: effects on the command, the machine, objects, contacts and sensors.
 
 One row each: where it sits, its parameters with their typical size, where fits start, and how it is written in a gap.
-The machine's joints are suspected together, not one by one. A new suspect is a new row.
+The machine's joints are suspected together, and those that move otherwise than foretold one by one, too. A new suspect
+is a new row.
 """
 
 from __future__ import annotations
@@ -66,17 +67,20 @@ class Suspect:
         )
 
 
-def suspects(task: AbstractTask, effects: Sequence[str] | None = None) -> list[Suspect]:
+def suspects(
+    task: AbstractTask, effects: Sequence[str] | None = None, joints: Sequence[str] | None = None
+) -> list[Suspect]:
     """Every suspect that can act on a task.
 
     Args:
         task: The nominal task.
         effects: Restrict to these names; all if None.
+        joints: That are suspected one by one; all that an actuator drives if None.
 
     Raises:
         UserError: For a name that is no suspect here.
     """
-    found = [*_commands(task), *_machine(task), *_objects(task), *_sensors(task)]
+    found = [*_commands(task), *_machine(task, joints), *_objects(task), *_sensors(task)]
     for name in effects or []:
         if name not in {s.effect for s in found}:
             raise unknown("effect", name, {s.effect for s in found}, "--effects")
@@ -139,17 +143,26 @@ def _commands(task: AbstractTask) -> list[Suspect]:
     return found
 
 
-def _machine(task: AbstractTask) -> list[Suspect]:
+def _machine(task: AbstractTask, joints: Sequence[str] | None) -> list[Suspect]:
     model = task.spec().compile()
+    driven = [int(j) for j in dict.fromkeys(model.actuator_trnid[:, 0])]
+    names = [model.joint(j).name for j in driven]
+    force = np.abs(model.actuator_forcerange).max(1)
+    force = np.where(force > 0, force, np.abs(model.actuator_ctrlrange).max(1))
+    strength = {
+        name: float(force[model.actuator_trnid[:, 0] == j].max()) for name, j in zip(names, driven, strict=True)
+    }
+    alone = names if joints is None else [name for name in names if name in joints]
+    found = []
+    for at in ["", *(alone if len(names) > 1 else [])]:
+        most, speed = strength[at] if at else max(strength.values()), 1.0  # rad/s, typical
+        found += [
+            _one("viscous_friction", "coefficient", 0.02 * most / speed, (0.02 * most / speed,), at=at),
+            _one("coulomb_friction", "torque", 0.02 * most, (0.01 * most,), at=at),
+            _one("armature", "inertia", 0.1, (0.1,), at=at),
+        ]
     last = model.body(int(model.jnt_bodyid[model.actuator_trnid[model.nu - 1, 0]])).name
-    force = float(np.abs(model.actuator_forcerange).max()) or float(np.abs(model.actuator_ctrlrange).max())
-    speed = 1.0  # rad/s, typical
-    return [
-        _one("viscous_friction", "coefficient", 0.02 * force / speed, (0.02 * force / speed,)),
-        _one("coulomb_friction", "torque", 0.02 * force, (0.01 * force,)),
-        _one("armature", "inertia", 0.1, (0.1,)),
-        _one("payload", "mass", 0.3, (0.3,), high=20.0, at=last),
-    ]
+    return [*found, _one("payload", "mass", 0.3, (0.3,), high=20.0, at=last)]
 
 
 def _objects(task: AbstractTask) -> list[Suspect]:

@@ -56,6 +56,17 @@ def test_ice_is_named_by_how_far_the_puck_slides(deployed) -> None:
     assert not any(law.where.startswith("drive") for law in found.laws.laws), "commands reach the servos as they are"
 
 
+def test_one_joint_is_told_from_all_by_its_force(deployed) -> None:
+    run = deployed({"coulomb_friction": {"torque": 2.0, "at": ["joint4"]}})
+    named = diagnose_run(run, effects=["coulomb_friction", "actuator_gain"], max_effects=2).as_dict()
+    (effect,) = named["effects"]
+    assert (named["verdict"], effect["name"], effect["at"]) == ("effect", "coulomb_friction", ["joint4"])
+    assert effect["parameters"]["torque"]["unit"] == "N m"
+    assert effect["parameters"]["torque"]["value"] == pytest.approx(2.0, abs=0.03)
+    other = diagnose_run(run, effects=["actuator_gain"], max_effects=1).as_dict()
+    assert other["verdict"] == "unknown" and "joint4" in other["reason"]
+
+
 def test_a_weak_drive_shows_as_a_slope_over_the_command(deployed) -> None:
     found = diagnose_run(deployed({"actuator_gain": {"gain": 0.7}}), effects=["actuator_gain"])
     law = found.laws.laws[0]
