@@ -117,8 +117,9 @@ def _no_name(
         if share > MATTERS:
             return "unknown", f"a flexible residual model explains {share:.1%} more of the error than {_list(there)}"
     times = np.sqrt(mean_error(setup, best, told))
+    unnamed = not tolerance.allows(there.fit) and judge.leaves_much(there.error, base.error, LEFT)
     if not best.effects:
-        if tolerance.asked and not settled(base) and not tolerance.allows(there.fit):
+        if tolerance.asked and not settled(base) and unnamed:
             return "unknown", "the nominal model's error is beyond the tolerance, and no name explains it"
         if there.effects:
             return "none", f"{_list(there)} is there, and too small to matter"
@@ -126,8 +127,9 @@ def _no_name(
             return "none", "the nominal model's error is within noise and the simulator's floor"
         tried = "no name" if residual_model is None else "no name and no flexible model"
         return "none", f"{tried} explains the error, {times:.1f} times noise and floor, on windows that were not fitted"
-    if not tolerance.allows(best.fit) and judge.leaves_much(best.error, base.error, LEFT):
-        return "unknown", f"{_list(best)} leaves {times:.1f} times noise and floor, which no name explains"
+    if unnamed:
+        times = np.sqrt(mean_error(setup, there, told))
+        return "unknown", f"{_list(there)} leaves {times:.1f} times noise and floor, which no name explains"
     return "", ""
 
 

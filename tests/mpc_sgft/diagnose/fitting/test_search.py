@@ -413,3 +413,18 @@ def test_a_rival_that_is_worse_with_the_traces_in_it_does_not_tie() -> None:
     assert find_ties(setup, best, there, [best, rival, there], rng) == [rival], "nobody has looked"
     assert find_ties(setup, best, there, [best, rival, there, worse], rng) == []
     assert find_ties(setup, best, there, [best, rival, there, worse._replace(errors=there.errors)], rng) == [rival]
+
+
+@pytest.mark.parametrize(("rest", "kind"), [(1.0, "effect"), (3.0, "unknown")])
+def test_what_traces_explain_is_no_unknown(rest: float, kind: str) -> None:
+    """Beside a name that matters, a trace and the rest: both together are beyond the tolerance."""
+    problem, fitted, none, rng = Lines(), np.arange(18), np.zeros(1), np.random.default_rng(5)
+    c, noise = problem.columns, rng.normal(size=problem.y.shape)
+    problem.y = 6 * c["b"] + 2.0 * c["c"] + rest * rng.normal(size=problem.y.shape) + noise
+    setup = Setup(problem, fitted, np.arange(18, 24), fitted // 3, fit(problem, [], [], fitted), none, none, np.log1p)
+    setup = replace(setup, squared=np.expm1)
+    sets = [judge_fit(setup, fit(problem, [term(n) for n in x], [np.ones(1)] * len(x), fitted)) for x in ("b", "bc")]
+    allowed = motion(problem, 2.15 / float(problem.y.std()), asked=True)
+    assert not allowed.allows(sets[0].fit)
+    verdict = reach_verdict(setup, [judge_fit(setup, setup.baseline), *sets], None, rng, allowed)
+    assert (verdict.kind, verdict.best.names, [t.term.effect for t in verdict.traces]) == (kind, ["b"], ["c"])
