@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,12 +12,14 @@ from mpc_sgft.diagnose.candidates.effect_table import EQUIVALENT, Equivalence
 from mpc_sgft.diagnose.candidates.library import IDLE_WHILE_NEUTRAL
 from mpc_sgft.diagnose.data.measured import Array
 from mpc_sgft.diagnose.fitting import judge
+from mpc_sgft.diagnose.fitting.fit import Fit
 from mpc_sgft.diagnose.fitting.hypothesis import Hypothesis, holds, without_effect
 from mpc_sgft.diagnose.fitting.prepare import ABOVE_NOISE, NOISE, Setup
 
 FIRST_GAIN = 0.025  # in log(1 + e), of the only effect where the nominal model leaves noise alone
 NEXT_GAIN = 0.06  # in log(1 + e), of one more effect where noise alone is left
 RICHER_SHARE = 0.2  # of what is worth a name, of a richer effect in place of one that it includes
+NEAREST = 8  # rivals that are simulated to see whether they foretell the same
 WIDER = 1.3  # of intervals: what windows that begin at each other's ends share; set on development seeds
 
 
@@ -78,7 +80,12 @@ def prune(setup: Setup[Any], best: Hypothesis, hypotheses: list[Hypothesis], rng
 
 
 def find_ties(
-    setup: Setup[Any], best: Hypothesis, there: Hypothesis, hypotheses: list[Hypothesis], rng: np.random.Generator
+    setup: Setup[Any],
+    best: Hypothesis,
+    there: Hypothesis,
+    hypotheses: list[Hypothesis],
+    rng: np.random.Generator,
+    alike: Callable[[Fit, Fit], bool] = lambda a, b: False,
 ) -> list[Hypothesis]:
     """Other sets of no more names and parameters than the best that are not credibly worse, best first.
 
@@ -91,6 +98,7 @@ def find_ties(
         there: The set of all that is there.
         hypotheses: All that were fitted.
         rng: For the bootstrap.
+        alike: Whether two fits foretell so much the same that it does not matter which is right: those tie.
     """
     rivals = [e for e in hypotheses if 0 < e.effects <= best.effects and 0 < e.complexity and no_larger(e, best)]
     other = [e for e in rivals if sorted(e.names) != sorted(best.names) and not holds(e, best)]
@@ -100,7 +108,8 @@ def find_ties(
         for e, rival, against in pairs
         if rival and judge.ruled_out(rival.errors, against.errors, rng, log_odds(setup, against, rival))
     ]
-    return sorted((e for e in other if not any(e is w for w in worse)), key=lambda e: e.error)
+    other.sort(key=lambda e: e.error)
+    return [e for i, e in enumerate(other) if not any(e is w for w in worse) or i < NEAREST and alike(e.fit, best.fit)]
 
 
 def with_all(e: Hypothesis, best: Hypothesis, there: Hypothesis, hypotheses: list[Hypothesis]) -> Hypothesis | None:

@@ -5,9 +5,9 @@ without it, foretell about as well: if its share of the nominal model's squared 
 
     share_i = (E(S without i) - E(S)) / E(nominal) < MATTERS,
 
-is small, and predictions change by less than SMALL of the motion. E is in units of noise, noise included: where the
-nominal model leaves noise alone, nothing can matter much. Where the user says what prediction error does not matter,
-that alone decides. A trace is listed with its size, and is no second name, no tie and no `unknown`.
+is small, and predictions do not change by more than SMALL of the motion for certain. E is in units of noise, noise
+included: where the nominal model leaves noise alone, nothing can matter much. Where the user says what prediction error
+does not matter, that alone decides. A trace is listed with its size, and is no second name, no tie and no `unknown`.
 
 Sources: smallest effect size of interest, Lakens, Scheel, Isager 2018 (10.1177/2515245918770963); share of variance
 explained (eta squared) and 0.01 as a small one of it, Cohen 1988, chapter 8.
@@ -20,12 +20,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mpc_sgft.diagnose.candidates.library import Term
+from mpc_sgft.diagnose.candidates.library import IDLE_WHILE_NEUTRAL, Term
 from mpc_sgft.diagnose.data.measured import Array
 from mpc_sgft.diagnose.fitting import judge
 from mpc_sgft.diagnose.fitting.fit import OUTLYING
 from mpc_sgft.diagnose.fitting.hypothesis import Hypothesis, holds, without_effect
 from mpc_sgft.diagnose.fitting.prepare import Setup
+from mpc_sgft.diagnose.verdict.naming import intervals
 from mpc_sgft.diagnose.verdict.tolerance import Tolerance
 
 MATTERS = 0.01  # of the nominal model's squared error, a tenth of its root mean square: what is less is a trace
@@ -67,7 +68,7 @@ def what_matters(
         i = int(np.argmin([s.share for s in shares]))
         without = without_effect(setup, best, i, hypotheses)
         small = tolerance.asked or shares[i].share < MATTERS
-        if small and tolerance.alike(without.fit, there.fit, by_window(told, setup)):
+        if small and tolerance.alike(without.fit, there.fit, by_window(told, setup), 1 / certain(best, i)):
             traces.append(shares[i])
             best = without
             continue
@@ -76,6 +77,16 @@ def what_matters(
             break
         best = simpler
     return best, sorted(traces, key=lambda s: -s.share)
+
+
+def certain(e: Hypothesis, i: int) -> float:
+    """Share of the i-th effect's size that is there at the nearer ends of its parameters' intervals, above 0."""
+    term, value, (low, high) = e.terms[i], e.values[i], intervals(e)[i]
+    counts = np.array([n not in IDLE_WHILE_NEUTRAL for n in term.names]) / term.size
+    least = np.clip(term.neutral, low, high)
+    return float(
+        max(np.linalg.norm((least - term.neutral) * counts) / np.linalg.norm((value - term.neutral) * counts), 1e-9)
+    )
 
 
 def shares_of(

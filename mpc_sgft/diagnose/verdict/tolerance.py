@@ -49,10 +49,11 @@ class Tolerance:
         missed = ((self.predict([f])[0] - self.measured) ** 2).mean((0, 1)) - self.noise**2
         return bool((missed <= self.limits**2).all())
 
-    def alike(self, a: Fit, b: Fit, told: Array) -> bool:
-        """Whether two fits predict much the same, on windows of these weights [W]."""
+    def alike(self, a: Fit, b: Fit, told: Array, times: float = 1.0) -> bool:
+        """Whether two fits predict the same but for so many times the tolerance, on windows of these weights [W]."""
         one, other = self.predict([a, b])
-        return bool((np.einsum("w,wns->s", told, (one - other) ** 2) / one[..., 0].size <= self.limits**2).all())
+        apart = np.einsum("w,wns->s", told, (one - other) ** 2) / one[..., 0].size
+        return bool((apart <= (times * self.limits) ** 2).all())
 
 
 def parse_tolerance(text: str) -> float | dict[str, str]:

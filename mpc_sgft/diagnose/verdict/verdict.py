@@ -8,13 +8,23 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mpc_sgft.diagnose.fitting import judge
+from mpc_sgft.diagnose.fitting.fit import Fit
 from mpc_sgft.diagnose.fitting.hypothesis import Hypothesis
 from mpc_sgft.diagnose.fitting.prepare import Setup
 from mpc_sgft.diagnose.fitting.residual_model import ResidualModel
 from mpc_sgft.diagnose.verdict.naming import as_given, canonical, choose, equivalence, find_ties, no_larger, settled
-from mpc_sgft.diagnose.verdict.relevance import MATTERS, Relevance, foretold, mean_error, shares_of, what_matters
+from mpc_sgft.diagnose.verdict.relevance import (
+    MATTERS,
+    Relevance,
+    by_window,
+    foretold,
+    mean_error,
+    shares_of,
+    what_matters,
+)
 from mpc_sgft.diagnose.verdict.tolerance import Tolerance
 
+TIED = 0.5  # of what the user tolerates: sets that foretell the same but for less tie, whatever the data say of them
 LEFT = 0.1  # share of the squared error above noise that names may leave
 
 
@@ -68,7 +78,12 @@ def reach_verdict(
         np.array([e.errors for e in rivals]), np.array([e.complexity for e in rivals]), rng, setup.problem.blocks
     )
     probability |= {e.key: float(s) for e, s in zip(rivals, wins, strict=True)}
-    best, ties = as_given(setup, best, find_ties(setup, best, there, hypotheses, rng))
+    told = by_window(foretold(setup, there), setup)
+
+    def alike(a: Fit, b: Fit) -> bool:
+        return tolerance.asked and tolerance.alike(a, b, told, TIED)
+
+    best, ties = as_given(setup, best, find_ties(setup, best, there, hypotheses, rng, alike))
     declared = [(e, equivalence(best, e)) for e in ties]
     kind, reason = _no_name(setup, there, best, base, residual_model, rng, tolerance)
     if kind:

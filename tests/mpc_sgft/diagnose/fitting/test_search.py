@@ -20,7 +20,8 @@ from mpc_sgft.diagnose.fitting.residual_model import ResidualModel
 from mpc_sgft.diagnose.fitting.screening import Effort
 from mpc_sgft.diagnose.fitting.search import no_worse, search, swaps
 from mpc_sgft.diagnose.simulation.plant import Change, Plant
-from mpc_sgft.diagnose.verdict.naming import find_ties, gains
+from mpc_sgft.diagnose.verdict.naming import find_ties, gains, intervals
+from mpc_sgft.diagnose.verdict.relevance import certain
 from mpc_sgft.diagnose.verdict.tolerance import Tolerance
 from mpc_sgft.diagnose.verdict.verdict import reach_verdict
 
@@ -428,3 +429,34 @@ def test_what_traces_explain_is_no_unknown(rest: float, kind: str) -> None:
     assert not allowed.allows(sets[0].fit)
     verdict = reach_verdict(setup, [judge_fit(setup, setup.baseline), *sets], None, rng, allowed)
     assert (verdict.kind, verdict.best.names, [t.term.effect for t in verdict.traces]) == (kind, ["b"], ["c"])
+
+
+@pytest.mark.parametrize(
+    ("limit", "asked", "kind"), [(0.3, True, "effect"), (1.0, True, "not_identifiable"), (1.0, False, "effect")]
+)
+def test_sets_that_foretell_the_same_for_the_user_tie(limit: float, asked: bool, kind: str) -> None:
+    """What no set holds is as large as that by which they differ, and decides for the wrong one."""
+    problem, fitted, none, rng = Lines(), np.arange(18), np.zeros(1), np.random.default_rng(5)
+    c, noise = problem.columns, 0.1 * rng.normal(size=problem.y.shape)
+    c["b"] = c["a"] + 0.05 * c["h"]
+    problem.y = 6 * c["a"] + 0.3 * c["h"] + noise
+    setup = Setup(problem, fitted, np.arange(18, 24), fitted // 3, fit(problem, [], [], fitted), none, none, np.log1p)
+    sets = [judge_fit(setup, fit(problem, [term(n)], [np.ones(1)], fitted)) for n in "ab"]
+    allowed = replace(motion(problem, limit / float(problem.y.std()), asked), noise=0.1 * np.ones(1))
+    verdict = reach_verdict(setup, [judge_fit(setup, setup.baseline), *sets], None, rng, allowed)
+    assert (verdict.kind, verdict.best.names) == (kind, ["b"])
+
+
+def test_an_effect_must_matter_for_certain() -> None:
+    problem, fitted, none, rng = Lines(), np.arange(18), np.zeros(1), np.random.default_rng(5)
+    c = problem.columns
+    problem.y = 3 * c["a"] + 0.2 * c["b"] + rng.normal(size=problem.y.shape)
+    setup = Setup(problem, fitted, np.arange(18, 24), fitted // 3, fit(problem, [], [], fitted), none, none, np.log1p)
+    both = judge_fit(setup, fit(problem, [term("a"), term("b")], [np.ones(1)] * 2, fitted))
+    (low,), (high,) = intervals(both)[1]
+    value = both.values[1][0]
+    assert low < 0.2 < high and certain(both, 1) == pytest.approx(low / value)
+    assert certain(both._replace(fit=both.fit._replace(values=(both.values[0], -both.values[1]))), 1) == pytest.approx(
+        low / value
+    )
+    assert certain(both._replace(fit=both.fit._replace(values=(both.values[0], 0.01 * both.values[1]))), 1) < 1e-6
