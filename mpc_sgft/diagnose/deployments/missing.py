@@ -57,6 +57,8 @@ def _flat(steps: Array, shift: int = 0) -> Array:
 
 def _worst(lacking: Array, scale: Array | float) -> list[int]:
     """Columns of [M, k] that are foretold worse than they can be, by mean squares in units of that, worst first."""
+    if not len(lacking):  # windows of a single step have none before
+        return []
     error = ((lacking / scale) ** 2).mean(0)
     return [int(i) for i in np.argsort(-error) if error[i] > 1]
 
