@@ -1,91 +1,21 @@
-"""What trains, what stays, and that it learns."""
+"""Pretraining: what an update changes, and that it learns."""
 
 import copy
 
 import pytest
 import torch
-from tensordict import TensorDict
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from torch.testing import assert_close
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from mpc_sgft.learning.agent import Agent
-from mpc_sgft.learning.world_model import PARTS, WorldModel
-from mpc_sgft.methods.sgft import SGFT
-from mpc_sgft.methods.tdmpc2 import TDMPC2
-from mpc_sgft.methods.zero_shot import ZeroShot
-
-SIZES = dict(obs_dim=6, action_dim=2, decode_dim=3, latent_dim=16, mlp_dim=32, enc_dim=32, num_q=2)
-NUMBERS = dict(
-    discount=0.9,
-    rho=0.5,
-    lr=3e-4,
-    encoder_lr_share=0.3,
-    grad_clip=20.0,
-    consistency_weight=20.0,
-    reward_weight=0.1,
-    q_weight=0.1,
-    value_weight=0.1,
-    decoder_weight=1.0,
-    target_rate=0.01,
-    scale_rate=0.01,
-    entropy_coef=0.01,
-    average_decay=0.5,
-    entropy_lr=1e-3,
+from mpc_sgft.learning.world_model import PARTS
+from tests.mpc_sgft.learning.agents import (
+    changed,
+    make_agent,
+    make_batch,
+    parts,
+    pretrained,
 )
-SHARED = dict(slice_len=3, action_noise=0.0)
-NO_GATE = dict(gate=False, gate_margin=0.9, gate_memory=5)
-OURS = dict(anchor=0.0, residual=False, command_map=False, command_lr=2e-2)
-SGFT_NUMBERS = dict(
-    horizon=4, lr=3e-4, policy_lr=3e-4, entropy_coef=1e-4, rho=0.5, updates=1, **SHARED, **NO_GATE, **OURS
-)
-
-
-def hand_over(agent: Agent, name: str = "sgft", **changes):
-    """Give an agent to a method; returns its update of a batch."""
-    if name == "sgft":
-        method = SGFT(**(SGFT_NUMBERS | changes))
-    else:
-        method = TDMPC2(updates=1, **SHARED) if name == "tdmpc2" else ZeroShot(**SHARED)
-    method.take_over(agent)
-    return lambda batch, weight=None: method.update(agent, batch, rollouts=1, weight=weight)
-
-
-def make_agent(sizes=None, **changes) -> Agent:
-    torch.manual_seed(0)
-    return Agent(WorldModel(**(SIZES | (sizes or {}))), **(NUMBERS | changes))
-
-
-def make_batch(seed=0, batch=32, steps=3, reward=None, terminated=False):
-    generator = torch.Generator().manual_seed(seed)
-    observation = torch.randn(batch, steps + 1, 6, generator=generator)
-    rewards = (
-        torch.randn(batch, steps, 1, generator=generator) if reward is None else torch.full((batch, steps, 1), reward)
-    )
-    ended = torch.zeros(batch, steps, 1, dtype=torch.bool)
-    ended[:, -1] = terminated
-    following = {"observation": observation[:, 1:], "reward": rewards, "terminated": ended}
-    action = torch.rand(batch, steps, 2, generator=generator) * 2 - 1
-    return TensorDict(
-        {"observation": observation[:, :-1], "action": action, "next": TensorDict(following, [batch, steps])},
-        [batch, steps],
-    )
-
-
-def pretrained(**changes) -> Agent:
-    agent = make_agent(**changes)
-    for i in range(5):
-        agent.update(make_batch(i))
-    return agent
-
-
-def parts(agent):
-    tensors = {p: {k: v.clone() for k, v in getattr(agent.model, p).state_dict().items()} for p in PARTS}
-    return tensors
-
-
-def changed(before, after):
-    return {p for p in PARTS if any(not torch.equal(before[p][k], after[p][k]) for k in before[p])}
 
 
 @pytest.mark.parametrize("num_q", [2, 5])
@@ -138,115 +68,6 @@ def test_truncated_steps_bootstrap_like_any_other():
     assert metrics == twin.update(other)
 
 
-@pytest.mark.parametrize("residual", [False, True])
-def test_sgft_changes_dynamics_and_policy_and_no_frozen_bit(residual):
-    agent = pretrained()
-    update = hand_over(agent, residual=residual)
-    before, frozen = parts(agent), agent.frozen_hash()
-    for i in range(3):
-        metrics = update(make_batch(10 + i))
-    assert changed(before, parts(agent)) == {"dynamics", "policy_head"}
-    assert agent.frozen_hash() == frozen
-    assert {"consistency_loss", "policy_loss", "objective"} <= set(metrics)
-    if residual:
-        base = {k: v for k, v in before["dynamics"].items() if k.startswith("base.")}
-        now = parts(agent)["dynamics"]
-        assert base and all(torch.equal(v, now[k]) for k, v in base.items())
-
-
-def test_frozen_hash_notices_a_single_changed_entry():
-    agent = pretrained()
-    hand_over(agent)
-    frozen = agent.frozen_hash()
-    with torch.no_grad():
-        agent.model.normalizer.mean[0] += 1e-6
-    assert agent.frozen_hash() != frozen
-
-
-def test_tdmpc2_trains_everything_but_the_normaliser():
-    agent = pretrained()
-    update = hand_over(agent, "tdmpc2")
-    before, frozen = parts(agent), agent.frozen_hash()
-    for i in range(3):
-        update(make_batch(10 + i))
-    assert changed(before, parts(agent)) == set(PARTS) - {"normalizer"}
-    assert agent.frozen_hash() == frozen
-
-
-def test_zero_shot_trains_nothing_and_says_so():
-    agent = pretrained()
-    update, before = hand_over(agent, "zero_shot"), parts(agent)
-    with pytest.raises(ValueError, match="zero_shot"):
-        update(make_batch())
-    assert changed(before, parts(agent)) == set() and agent.trainable == ()
-
-
-def test_transfer_lowers_the_model_error_on_what_it_saw():
-    agent = pretrained()
-    update = hand_over(agent, lr=3e-3)
-    batch = make_batch(77, batch=16)
-    before = agent.model_error(batch)
-    for _ in range(150):
-        update(batch)
-    assert before.shape == (16, 3)
-    assert agent.model_error(batch).mean() < 0.7 * before.mean()
-
-
-def test_slice_weights_choose_what_the_dynamics_learn():
-    agent = pretrained()
-    update = hand_over(agent, lr=3e-3)
-    batch, weight = make_batch(77, batch=16), torch.tensor([2.0, 0.0]).repeat(8)
-    before = agent.model_error(batch)
-    for _ in range(150):
-        update(batch, weight)
-    ratio = agent.model_error(batch).mean(1) / before.mean(1)
-    assert ratio[::2].mean() < ratio[1::2].mean() - 0.1
-
-
-def test_anchor_keeps_the_dynamics_near_the_pretrained_ones():
-    def distance(anchor):
-        agent = pretrained()
-        update = hand_over(agent, lr=3e-3, anchor=anchor)
-        before = parts(agent)["dynamics"]
-        for i in range(30):
-            update(make_batch(i))
-        return sum((v - before[k]).square().sum() for k, v in parts(agent)["dynamics"].items())
-
-    assert distance(1.0) < 0.2 * distance(0.0)
-
-
-def test_snapshot_and_restore_undo_updates_and_go_on_alike():
-    agent = pretrained()
-    update = hand_over(agent)
-    update(make_batch(1))
-    snapshot, noise = agent.snapshot(), agent.generator.get_state()
-    first = [update(make_batch(i)) for i in (2, 3)]
-    after = parts(agent)
-    agent.restore(snapshot)
-    assert changed(after, parts(agent)) == {"dynamics", "policy_head"}
-    agent.generator.set_state(noise)
-    assert [update(make_batch(i)) for i in (2, 3)] == first
-
-
-@pytest.mark.parametrize("method", [None, "sgft", "tdmpc2", "residual"])
-def test_resume_gives_the_same_numbers(method):
-    def begin(agent):
-        if method is None:
-            return agent.update
-        return hand_over(agent, "sgft", horizon=2, residual=True) if method == "residual" else hand_over(agent, method)
-
-    agent = pretrained()
-    update = begin(agent)
-    update(make_batch(20))
-    state = agent.state_dict()
-    expected = [update(make_batch(i)) for i in (21, 22)]
-    twin = make_agent()
-    again = begin(twin)
-    twin.load_state_dict(state)
-    assert [again(make_batch(i)) for i in (21, 22)] == expected
-    assert changed(parts(agent), parts(twin)) == set()
-
-
 def test_a_policy_update_leaves_no_gradient_in_the_critics():
     agent = make_agent()
     agent.model_optimizer.zero_grad()
@@ -279,19 +100,6 @@ def test_value_and_decoder_never_train_the_encoder():
         agent.update(make_batch(i))
     assert changed(before, parts(agent)) & {"encoder", "dynamics"} == set()
     assert {"value_head", "decoder"} <= changed(before, parts(agent))
-
-
-@pytest.mark.parametrize("transfer", [False, True])
-@pytest.mark.parametrize("name", ["observation", "action", "reward"])
-def test_a_batch_that_is_not_finite_is_named_and_changes_nothing(transfer, name):
-    agent, batch = pretrained(), make_batch()
-    update = hand_over(agent) if transfer else agent.update
-    place = batch["action"] if name == "action" else batch["next", name]
-    place[1, -1, 0] = torch.nan
-    before = parts(agent)
-    with pytest.raises(FloatingPointError, match=f"^{name} is not finite"):
-        update(batch)
-    assert changed(before, parts(agent)) == set()
 
 
 def test_a_loss_that_is_not_finite_is_named_and_changes_nothing():

@@ -1,0 +1,199 @@
+"""Which of the fitted sets is the answer, on a problem made by hand."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mpc_sgft.diagnose.fitting.fit import fit
+from mpc_sgft.diagnose.fitting.hypothesis import Hypothesis, judge_fit
+from mpc_sgft.diagnose.fitting.prepare import NOISE, Setup
+from mpc_sgft.diagnose.fitting.residual_model import ResidualModel
+from mpc_sgft.diagnose.verdict.naming import find_ties, gains, intervals
+from mpc_sgft.diagnose.verdict.relevance import certain
+from mpc_sgft.diagnose.verdict.verdict import reach_verdict
+from tests.mpc_sgft.diagnose.lines import Lines, motion, term
+
+
+def test_where_noise_alone_is_left_one_more_effect_must_gain_more_than_the_only_one() -> None:
+    problem, fitted, none = Lines(), np.arange(18), np.zeros(1)
+    setup = Setup(
+        problem,
+        fitted,
+        np.arange(18, 24),
+        fitted // 3,
+        fit(problem, [], [], fitted),
+        none,
+        none,
+        quiet=NOISE + 0.1,
+    )
+    base, rng = judge_fit(setup, setup.baseline), np.random.default_rng(0)
+    scatter = np.abs(0.01 * rng.normal(size=24))
+
+    def better(before: float, gain: float, effects: int = 0) -> bool:
+        small, large = (base._replace(errors=x + scatter) for x in (before, before - gain - scatter))
+        return gains(setup, small._replace(effects=effects), large, rng)
+
+    assert not better(0.65, 0.005) and better(0.65, 0.03)
+    assert not better(0.65, 0.03, effects=1) and better(0.65, 0.1, effects=1)
+    assert not better(0.95, 0.03) and better(0.95, 0.045)
+
+
+def test_a_richer_effect_in_place_of_what_it_includes_need_gain_less_than_a_further_one() -> None:
+    problem, fitted, none = Lines(), np.arange(18), np.zeros(1)
+    setup = Setup(problem, fitted, np.arange(18, 24), fitted // 3, fit(problem, [], [], fitted), none, none)
+    base, rng = judge_fit(setup, setup.baseline)._replace(effects=1), np.random.default_rng(0)
+    scatter = np.abs(0.01 * rng.normal(size=24))
+
+    def better(name: str, gain: float) -> bool:
+        small, large = (base._replace(fit=base.fit._replace(terms=(term(t),))) for t in ("coulomb_friction", name))
+        errors = 0.65 + scatter, 0.65 - gain - scatter
+        return gains(setup, small._replace(errors=errors[0]), large._replace(errors=errors[1]), rng)
+
+    assert better("stribeck_friction", 0.02) and not better("stribeck_friction", -0.01)
+    assert not better("deadband", 0.02) and better("deadband", 0.1)
+
+
+@pytest.mark.parametrize(("mass", "kind"), [(1.0, "effect"), (0.9, "not_identifiable")])
+def test_a_tie_that_needs_another_mass_loses_against_one_that_finds_it_as_given(mass: float, kind: str) -> None:
+    problem, fitted, none, one = Lines(), np.arange(18), np.zeros(1), np.ones(1)
+    c = problem.columns
+    c["nominal"] = 100 * c["h"]
+    c["b"] = c["a"] + 0.05 * c["nominal"]
+    problem.y = mass * c["nominal"] + 3 * c["a"] + np.random.default_rng(3).normal(size=problem.y.shape)
+    nominal = replace(term("nominal"), neutral=one, low=0.7 * one, high=1.3 * one, size=0.15 * one)
+    base = fit(problem, [nominal], [one], fitted)
+    setup = Setup(problem, fitted, np.arange(18, 24), fitted // 3, base, none, none, np.log1p)
+    named = [judge_fit(setup, fit(problem, [nominal, term(x)], [one, one], fitted)) for x in "ba"]
+    verdict = reach_verdict(setup, [judge_fit(setup, base), *named], None, np.random.default_rng(0), motion(problem))
+    assert verdict.kind == kind and sorted({*verdict.best.names, *(n for e, _ in verdict.ties for n in e.names)}) == (
+        ["a"] if kind == "effect" else ["a", "b"]
+    )
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "kind"), [(60.0, 8.0, "unknown"), (60.0, 6.0, "effect"), (6.0, 1.9, "effect")]
+)
+def test_names_that_leave_much_of_an_error_are_no_answer(before: float, after: float, kind: str) -> None:
+    problem, fitted, none = Lines(), np.arange(18), np.zeros(1)
+    setup = Setup(problem, fitted, np.arange(18, 24), fitted // 3, fit(problem, [], [], fitted), none, none)
+    scatter = 0.01 * np.random.default_rng(0).normal(size=24)
+    base = judge_fit(setup, setup.baseline)._replace(errors=np.log1p(before) + scatter)
+    named = judge_fit(setup, fit(problem, [term("a")], [np.ones(1)], fitted))._replace(errors=np.log1p(after) + scatter)
+    verdict = reach_verdict(setup, [base, named], None, np.random.default_rng(0), motion(problem))
+    assert verdict.kind == kind
+    assert verdict.probability[frozenset({"b"})] == 0, "a set that is only fitted to tell shares has won nothing"
+
+
+@pytest.mark.parametrize(
+    ("left", "flexible", "kind", "words"),
+    [
+        (1.1, None, "none", "within noise"),
+        (6.0, None, "none", "no name explains the error"),
+        (6.0, 5.9, "none", "no name and no flexible model explains the error"),
+        (6.0, 2.0, "unknown", "a flexible residual model explains"),
+    ],
+)
+def test_an_error_is_unknown_if_a_flexible_model_explains_it(
+    left: float, flexible: float | None, kind: str, words: str
+) -> None:
+    problem, fitted, none = Lines(), np.arange(18), np.zeros(1)
+    setup = Setup(problem, fitted, np.arange(18, 24), fitted // 3, fit(problem, [], [], fitted), none, none)
+    errors = np.log1p(left) + 0.01 * np.random.default_rng(0).normal(size=24)
+    base = judge_fit(setup, setup.baseline)._replace(errors=errors)
+    model = None if flexible is None else ResidualModel(errors + np.log1p(flexible) - np.log1p(left), np.zeros(1), 1.0)
+    verdict = reach_verdict(setup, [base], model, np.random.default_rng(0), motion(problem))
+    assert verdict.kind == kind and words in verdict.reason
+    assert not verdict.best.effects
+
+
+@pytest.mark.parametrize(("limit", "kind"), [(0.5, "unknown"), (1.1, "effect"), (4.0, "none")])
+def test_what_is_left_within_the_tolerance_is_no_unknown(limit: float, kind: str) -> None:
+    """Half of the error has a name; the rest is as large, and no name's."""
+    problem, fitted, none, rng = Lines(), np.arange(18), np.zeros(1), np.random.default_rng(5)
+    rest = 3 * rng.normal(size=problem.y.shape)
+    problem.y = 6 * problem.columns["b"] + rest
+    setup = Setup(problem, fitted, np.arange(18, 24), fitted // 3, fit(problem, [], [], fitted), none, none, np.log1p)
+    setup = replace(setup, squared=np.expm1)
+    named = judge_fit(setup, fit(problem, [term("b")], [np.ones(1)], fitted))
+    allowed = motion(problem, limit * float(np.sqrt((rest**2).mean() - 1)) / float(problem.y.std()), asked=True)
+    verdict = reach_verdict(setup, [judge_fit(setup, setup.baseline), named], None, rng, allowed)
+    assert verdict.kind == kind, verdict.reason
+    assert [t.term.effect for t in verdict.traces] == (["b"] if kind == "none" else [])
+
+
+@pytest.mark.parametrize(
+    ("limit", "asked", "kind"), [(0.5, True, "unknown"), (4.0, True, "none"), (0.5, False, "none")]
+)
+def test_an_error_beyond_the_tolerance_that_no_name_explains_is_unknown(limit: float, asked: bool, kind: str) -> None:
+    problem, fitted, none, rng = Lines(), np.arange(18), np.zeros(1), np.random.default_rng(5)
+    problem.y = 3 * rng.normal(size=problem.y.shape)
+    setup = Setup(problem, fitted, np.arange(18, 24), fitted // 3, fit(problem, [], [], fitted), none, none, np.log1p)
+    setup = replace(setup, squared=np.expm1)
+    wrong = judge_fit(setup, fit(problem, [term("b")], [np.ones(1)], fitted))
+    allowed = motion(problem, limit, asked)
+    verdict = reach_verdict(setup, [judge_fit(setup, setup.baseline), wrong], None, rng, allowed)
+    assert verdict.kind == kind, verdict.reason
+
+
+def test_a_rival_that_is_worse_with_the_traces_in_it_does_not_tie() -> None:
+    problem, fitted, none, rng = Lines(), np.arange(18), np.zeros(1), np.random.default_rng(0)
+    setup = Setup(problem, fitted, np.arange(18, 24), fitted // 3, fit(problem, [], [], fitted), none, none, np.log1p)
+
+    def judged(names: str, error: float) -> Hypothesis:
+        h = judge_fit(setup, fit(problem, [term(n) for n in names], [np.ones(1)] * len(names), fitted))
+        return h._replace(errors=error + 0.01 * np.random.default_rng(len(names)).normal(size=24))
+
+    best, rival, there, worse = judged("a", 1.3), judged("b", 1.25), judged("ac", 0.9), judged("bc", 1.1)
+    assert find_ties(setup, best, best, [best, rival, there, worse], rng) == [rival]
+    assert find_ties(setup, best, there, [best, rival, there], rng) == [rival], "nobody has looked"
+    assert find_ties(setup, best, there, [best, rival, there, worse], rng) == []
+    assert find_ties(setup, best, there, [best, rival, there, worse._replace(errors=there.errors)], rng) == [rival]
+
+
+@pytest.mark.parametrize(("rest", "kind"), [(1.0, "effect"), (3.0, "unknown")])
+def test_what_traces_explain_is_no_unknown(rest: float, kind: str) -> None:
+    """Beside a name that matters, a trace and the rest: both together are beyond the tolerance."""
+    problem, fitted, none, rng = Lines(), np.arange(18), np.zeros(1), np.random.default_rng(5)
+    c, noise = problem.columns, rng.normal(size=problem.y.shape)
+    problem.y = 6 * c["b"] + 2.0 * c["c"] + rest * rng.normal(size=problem.y.shape) + noise
+    setup = Setup(problem, fitted, np.arange(18, 24), fitted // 3, fit(problem, [], [], fitted), none, none, np.log1p)
+    setup = replace(setup, squared=np.expm1)
+    sets = [judge_fit(setup, fit(problem, [term(n) for n in x], [np.ones(1)] * len(x), fitted)) for x in ("b", "bc")]
+    allowed = motion(problem, 2.15 / float(problem.y.std()), asked=True)
+    assert not allowed.allows(sets[0].fit)
+    verdict = reach_verdict(setup, [judge_fit(setup, setup.baseline), *sets], None, rng, allowed)
+    assert (verdict.kind, verdict.best.names, [t.term.effect for t in verdict.traces]) == (kind, ["b"], ["c"])
+
+
+@pytest.mark.parametrize(
+    ("limit", "asked", "kind"), [(0.3, True, "effect"), (1.0, True, "not_identifiable"), (1.0, False, "effect")]
+)
+def test_sets_that_foretell_the_same_for_the_user_tie(limit: float, asked: bool, kind: str) -> None:
+    """What no set holds is as large as that by which they differ, and decides for the wrong one."""
+    problem, fitted, none, rng = Lines(), np.arange(18), np.zeros(1), np.random.default_rng(5)
+    c, noise = problem.columns, 0.1 * rng.normal(size=problem.y.shape)
+    c["b"] = c["a"] + 0.05 * c["h"]
+    problem.y = 6 * c["a"] + 0.3 * c["h"] + noise
+    setup = Setup(problem, fitted, np.arange(18, 24), fitted // 3, fit(problem, [], [], fitted), none, none, np.log1p)
+    sets = [judge_fit(setup, fit(problem, [term(n)], [np.ones(1)], fitted)) for n in "ab"]
+    allowed = replace(motion(problem, limit / float(problem.y.std()), asked), noise=0.1 * np.ones(1))
+    verdict = reach_verdict(setup, [judge_fit(setup, setup.baseline), *sets], None, rng, allowed)
+    assert (verdict.kind, verdict.best.names) == (kind, ["b"])
+
+
+def test_an_effect_must_matter_for_certain() -> None:
+    problem, fitted, none, rng = Lines(), np.arange(18), np.zeros(1), np.random.default_rng(5)
+    c = problem.columns
+    problem.y = 3 * c["a"] + 0.2 * c["b"] + rng.normal(size=problem.y.shape)
+    setup = Setup(problem, fitted, np.arange(18, 24), fitted // 3, fit(problem, [], [], fitted), none, none, np.log1p)
+    both = judge_fit(setup, fit(problem, [term("a"), term("b")], [np.ones(1)] * 2, fitted))
+    (low,), (high,) = intervals(both)[1]
+    value = both.values[1][0]
+    assert low < 0.2 < high and certain(both, 1) == pytest.approx(low / value)
+    assert certain(both._replace(fit=both.fit._replace(values=(both.values[0], -both.values[1]))), 1) == pytest.approx(
+        low / value
+    )
+    assert certain(both._replace(fit=both.fit._replace(values=(both.values[0], 0.01 * both.values[1]))), 1) < 1e-6
