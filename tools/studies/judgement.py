@@ -78,7 +78,7 @@ def search_once() -> Iterator[None]:
     from mpc_sgft.diagnose import run
 
     before = {name: getattr(run, name) for name in ("search", "run", "near_fit", "refit", "fit_residual_model")}
-    searched: list[tuple[Any, tuple[Any, ...]]] = []
+    searched: list[tuple[Any, tuple[Any, ...]]] = []  # None for a problem that the search left as it was
     fitted: dict[tuple[Any, ...], Any] = {}
     calls = 0
 
@@ -86,10 +86,10 @@ def search_once() -> Iterator[None]:
         nonlocal calls
         if calls == len(searched):
             setup, hypotheses = before["search"](*args, **kwargs)
-            searched.append((setup, tuple(hypotheses)))
+            searched.append((None if setup is args[0] else setup, tuple(hypotheses)))
         setup, hypotheses = searched[calls]
         calls += 1
-        return setup, list(hypotheses)  # judging adds to it
+        return args[0] if setup is None else setup, list(hypotheses)  # judging adds to it
 
     def again(*args: Any, **kwargs: Any) -> Any:
         nonlocal calls

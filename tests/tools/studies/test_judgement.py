@@ -40,6 +40,17 @@ def test_a_case_is_searched_once(monkeypatch: pytest.MonkeyPatch) -> None:
     assert searched == ["first", "second"] and runs.search is search and runs.run is run
 
 
+def test_a_problem_that_the_search_leaves_is_that_of_each_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    def run() -> bool:
+        first = object()
+        return runs.search(first)[0] is first  # pyright: ignore
+
+    monkeypatch.setattr(runs, "search", lambda setup: (setup, []))
+    monkeypatch.setattr(runs, "run", run)
+    with search_once():
+        assert runs.run() and runs.run()  # pyright: ignore
+
+
 def test_rows_count_right_answers_and_changed_ones() -> None:
     def label(group: str, *names: str) -> dict:
         effects = [{"name": n, "at": ["j"], "multiple": 3.0, "parameters": {}} for n in names]
