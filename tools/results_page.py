@@ -107,6 +107,38 @@ def blind() -> str:
     return table(["asked", "goal", "measured", "cases"], lines) + "\n\nBeside simpler ways:\n\n" + simple
 
 
+def foreign() -> str:
+    rows = read("foreign/foreign.csv")
+    grounds = list(dict.fromkeys(r["ground"] for r in rows))
+    by = {(r["ground"], r["score"]): r for r in rows}
+    lines = []
+    for score in dict.fromkeys(r["score"] for r in rows):
+        cells = [scored(by[g, score]) if (g, score) in by else "" for g in grounds]
+        lines.append([score, next(r["goal"] for r in rows if r["score"] == score), *cells])
+    return table(["asked", "goal", *(f"`{g}`" for g in grounds)], lines)
+
+
+def scored(row: Row) -> str:
+    """A share or a number of seconds, its interval, and of how many."""
+    write = digits if "seconds" in row["score"] else percent
+    return f"{write(row['value'])} [{write(row['low'])}, {write(row['high'])}] of {row['of']}"
+
+
+def judgement() -> str:
+    rows = read("judgement/judgement.csv")
+    lines = []
+    for name in dict.fromkeys(r["without"] for r in rows):
+        mine = [r for r in rows if r["without"] == name]
+        right = sum(float(r[f"{g}_exact"] or 0) * int(r[f"{g}_exact_of"]) for r in mine for g in ("single", "pair"))
+        wrong = sum(float(r[g] or 0) * int(r[f"{g}_of"]) for r in mine for g in ("false_alarms", "wrong_outside"))
+        inside = sum(float(r["coverage"] or 0) * int(r["coverage_of"]) for r in mine)
+        of = sum(int(r["coverage_of"]) for r in mine)
+        changed = sum(int(r["changed"]) for r in mine)
+        lines.append([f"`{name}`", changed, f"{right:.0f}", f"{wrong:.0f}", f"{inside:.0f} of {of}"])
+    head = ("without", "answers that change", "exact sets", "wrong names", "intervals that cover")
+    return table(head, lines)
+
+
 def loop() -> str:
     head = {
         "gap": "gap",
@@ -215,6 +247,8 @@ STUDIES: dict[str, Callable[[], str]] = {
     "critic_profile": critic,
     "exact_dynamics": exact,
     "blind": blind,
+    "foreign": foreign,
+    "judgement": judgement,
     "emps": emps,
     "close_the_loop": loop,
     "stand_in": lambda: records("stand_in/stand_in.json", "stand_in/zero_shot.json"),
