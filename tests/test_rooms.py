@@ -37,7 +37,7 @@ DIAGNOSE = {  # the rooms inside it, likewise; what stands beside them may impor
     "fitting": {"data", "simulation", "candidates"},
     "verdict": {"data", "simulation", "candidates", "fitting"},
     "page": {"data", "simulation", "candidates", "fitting", "verdict"},
-    "deployments": {"data", "simulation", "candidates", "fitting", "verdict"},
+    "deployments": {"data", "simulation", "candidates", "fitting", "verdict", "page"},
 }
 
 
