@@ -6,6 +6,7 @@ from numpy.typing import NDArray
 
 from envs import fr3, kinematics
 from envs.effects.passive import stiffen_dry_friction
+from envs.fixture import add_fixture
 from envs.task import AbstractTask, Array, Start, ValuePlane, View, whole_steps
 
 TCP = 0.1034  # [m] from the flange to where the hand holds the handle
@@ -14,7 +15,6 @@ HEAD_RADIUS, HANDLE_RADIUS = 0.015, 0.01  # [m]
 SWUNG = (1, 3, 5)  # joints that are commanded; the others hold the arm in a vertical plane
 REST = np.array([0.0, -0.93, 0.0, -2.0, 0.0, 1.08, 0.0])  # [rad] the face on a nail in the middle of the range
 LOW, HIGH = np.array([-1.5, -2.7, 0.65]), np.array([-0.2, -1.0, 1.9])  # [rad] of the commanded joints
-MOUNT = 1e6  # [kg] of what holds the nail: no blow moves it
 NAIL_INERTIA = 0.3  # [kg] that a blow has to start, nail and wood
 RAISED, CLOSE = 0.14, 0.02  # [m] of the face above the nail, before a blow and when it hit
 NSAMPLE = 500  # physics steps of command history that the model holds, so that a delay is a parameter
@@ -97,11 +97,9 @@ class Hammer(AbstractTask):
         head.contype = fr3.OBJECT_BIT
 
     def _add_nail(self, spec: mujoco.MjSpec) -> None:
-        """A nail on a slide, in a board that an episode's start puts somewhere and nothing moves from there."""
+        """A nail on a slide, in a board."""
         slide, cylinder = mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtGeom.mjGEOM_CYLINDER
-        board = spec.worldbody.add_body(name="board", gravcomp=1)
-        for name, axis in (("board_x", [1, 0, 0]), ("board_z", [0, 0, 1])):
-            board.add_joint(name=name, type=slide, axis=axis).armature = MOUNT
+        board = add_fixture(spec, "board", "x z")
         board.add_geom(
             name="board",
             type=mujoco.mjtGeom.mjGEOM_BOX,

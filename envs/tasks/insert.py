@@ -1,0 +1,193 @@
+"""Put a table's leg into its hole with an FR3."""
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from envs import fr3, kinematics
+from envs.fixture import add_fixture
+from envs.task import AbstractTask, Array, Start, ValuePlane, View, whole_steps
+
+TCP = 0.1034  # [m] from the flange to where the hand holds the leg
+BELOW = 0.08  # [m] from there to the leg's end
+REST = np.array([0.0, -0.1, 0.0, -2.3, 0.0, 2.2, 0.785])  # [rad]
+TOP = 0.10  # [m] height of the table above the robot's base
+START = 0.10  # [m] of the leg's end above the table, at the start
+WALLS = 12  # boxes around the hole
+WALL = 0.03  # [m] width of the rim
+LOW, HIGH = np.array([0.35, -0.15, TOP - 0.05]), np.array([0.65, 0.15, TOP + 0.2])  # [m] where the leg's end may go
+NSAMPLE = 500  # physics steps of command history that the model holds, so that a delay is a parameter
+
+
+class Insert(AbstractTask):
+    """Lower the leg into the hole until its end is `depth` below the table.
+
+    Observation: place of the hand, of the leg's end, and where that has to be, x, y, z each [m], in the frame of the
+    base. Action: change of the commanded place of the leg's end. 5 Hz, 40 steps.
+
+        r = 1[|dx|, |dy|, |dz| < 1 cm] - 100 (dx^2 + dy^2 + dz^2), each of the differences at most 10 cm
+
+    Success: all three are below 1 cm when the episode ends; the hole is narrower than that, so that the leg is in it.
+
+    Source: Yin, Westenbroek et al., ICLR 2025, inserting. The hole is `clearance` times as wide as the leg, as there;
+    it is round, and so is the leg, since the hand does not turn.
+    """
+
+    name = "insert"
+    observation_names = tuple(f"{what}_{axis}" for what in ("hand", "leg", "hole") for axis in "xyz")
+    action_dim = 3
+    moves_in_plane = True
+
+    def __init__(
+        self,
+        *,
+        step_size: float,
+        episode_steps: int,
+        control_dt: float,
+        sim_dt: float,
+        hole_x: tuple[float, float],
+        hole_y: tuple[float, float],
+        hole_yaw: tuple[float, float],
+        leg_radius: float,
+        clearance: float,
+        depth: float,
+        friction: float,
+        tolerance: float,
+        start_noise: float,
+    ):
+        whole_steps(control_dt, sim_dt)
+        self.step_size, self.episode_steps = step_size, episode_steps
+        self.control_dt, self.sim_dt = control_dt, sim_dt
+        self.hole_x, self.hole_y, self.hole_yaw = hole_x, hole_y, hole_yaw
+        self.leg_radius, self.clearance, self.depth = leg_radius, clearance, depth
+        self.friction, self.tolerance, self.start_noise = friction, tolerance, start_noise
+        self._home: Array | None = None
+
+    def spec(self) -> mujoco.MjSpec:
+        spec = mujoco.MjSpec()
+        spec.compiler.degree = False
+        spec.option.timestep = self.sim_dt
+        spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+        spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+        spec.worldbody.add_light(pos=[0.3, -0.6, 1.6], dir=[0, 0.35, -1], type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
+        spec.worldbody.add_camera(name="side", pos=[1.15, -0.85, 0.6], xyaxes=[0.75, 0.66, 0, -0.28, 0.32, 0.9])
+        hand = fr3.add_fr3(spec, base=(0, 0, 0), tool_length=TCP, tool_radius=0.02)
+        leg = hand.add_body(name="leg", pos=[0, 0, fr3.FLANGE + TCP], gravcomp=1)
+        leg.add_geom(
+            name="leg",
+            type=mujoco.mjtGeom.mjGEOM_CYLINDER,
+            size=[self.leg_radius, (BELOW + 0.02) / 2, 0],
+            pos=[0, 0, (BELOW - 0.02) / 2],
+            mass=0.1,
+            friction=[self.friction, 0.005, 0.0001],
+            priority=1,
+            rgba=[0.72, 0.52, 0.3, 1],
+            contype=fr3.OBJECT_BIT,
+            conaffinity=0,
+        )
+        for actuator in spec.actuators:  # a zero delay and a vanishing lag, so that both are parameters of the model
+            actuator.nsample, actuator.delay = NSAMPLE, 0.0
+            actuator.dyntype, actuator.actearly = mujoco.mjtDyn.mjDYN_FILTEREXACT, 1
+            actuator.dynprm[0] = 1e-6
+        self._add_table(spec)
+        return spec
+
+    def _add_table(self, spec: mujoco.MjSpec) -> None:
+        """A round hole of boxes that stand around its floor."""
+        table = add_fixture(spec, "table", "x y yaw")
+        radius = self.leg_radius * self.clearance
+        half = (radius + WALL) * np.tan(np.pi / WALLS)
+        angles = 2 * np.pi * np.arange(WALLS) / WALLS
+        shapes = [
+            ([WALL / 2, half, TOP / 2], [(radius + WALL / 2) * np.cos(a), (radius + WALL / 2) * np.sin(a), TOP / 2], a)
+            for a in angles
+        ]
+        floor = TOP - self.depth
+        for i, (size, place, angle) in enumerate([*shapes, ([radius, radius, floor / 2], [0, 0, floor / 2], 0.0)]):
+            table.add_geom(
+                name=f"table_{i}",
+                type=mujoco.mjtGeom.mjGEOM_BOX,
+                size=size,
+                pos=place,
+                quat=[np.cos(angle / 2), 0, 0, np.sin(angle / 2)],
+                mass=0.1,
+                rgba=[0.80, 0.74, 0.64, 1],
+                contype=0,
+                conaffinity=fr3.OBJECT_BIT,
+            )
+
+    def home(self) -> Array:
+        """Joint angles [1, 7] with the leg above the middle of the table; computed once."""
+        if self._home is None:
+            middle = np.array([[np.mean(self.hole_x), np.mean(self.hole_y), TOP + START]], float)
+            q = REST[None]
+            for _ in range(30):
+                q = self._joints(q, middle)
+            self._home = q
+        return self._home
+
+    def start(self, rng: np.random.Generator) -> Start:
+        place = np.array([[np.mean(self.hole_x), np.mean(self.hole_y), TOP + START]], float)
+        place = place + rng.uniform(-self.start_noise, self.start_noise, (1, 3))
+        q = self._joints(self.home(), place)
+        hole = [rng.uniform(*self.hole_x), rng.uniform(*self.hole_y), rng.uniform(*self.hole_yaw)]
+        return Start(qpos=np.concatenate([q[0], hole])[None], qvel=np.zeros((1, 10)), target=place)
+
+    def move(self, target: Array, action: Array) -> Array:
+        return np.clip(target + self.step_size * action, LOW, HIGH)
+
+    def ctrl(self, target: Array, previous_ctrl: Array) -> Array:
+        return self._joints(previous_ctrl, target)
+
+    def hold(self, qpos: Array) -> Array:
+        return kinematics.tip_position(qpos[:, :7], TCP + BELOW)
+
+    def place(self, observation: Array, qpos: Array) -> Array:
+        """The table where its hole is seen; its turn is not observed and left as it is."""
+        placed = qpos.copy()
+        placed[:, 7:9] = observation[:, 6:8]
+        return placed
+
+    def observe(self, qpos: Array, qvel: Array) -> Array:
+        hand, leg = (kinematics.tip_position(qpos[:, :7], length) for length in (TCP, TCP + BELOW))
+        return np.concatenate([hand, leg, qpos[:, 7:9], np.full((len(qpos), 1), TOP - self.depth)], 1)
+
+    def reward(self, observation: Array, action: Array) -> Array:
+        apart = np.abs(observation[:, 3:6] - observation[:, 6:9])
+        return self.success(observation) - 100 * (np.minimum(apart, 0.1) ** 2).sum(1)
+
+    def success(self, observation: Array) -> NDArray[np.bool_]:
+        return np.all(np.abs(observation[:, 3:6] - observation[:, 6:9]) < self.tolerance, axis=1)
+
+    def scripted(self, observation: Array) -> Array:
+        """Stand above the hole, and go down while the leg is over it."""
+        apart = observation[:, 6:9] - observation[:, 3:6]
+        aside = np.linalg.norm(apart[:, :2], axis=1)
+        inside = observation[:, 5] < TOP - 0.003
+        down = np.where(inside | (aside < 0.5 * (self.clearance - 1) * self.leg_radius), -0.02, 0.0)
+        hover = TOP + 0.004 - observation[:, 5]
+        dz = np.where(down < 0, down, np.where(inside, 0.0, hover))
+        return np.clip(np.concatenate([apart[:, :2], dz[:, None]], 1) / self.step_size, -1, 1)
+
+    def points(self, observation: Array) -> dict[str, Array]:
+        return {"tool": observation[..., 3:6], "object": observation[..., 6:9]}
+
+    def place_of(self, qpos: Array) -> Array:
+        return np.concatenate([qpos[:, 7:9], np.full((len(qpos), 1), TOP)], 1)
+
+    def view(self) -> View:
+        return View(eye=(1.05, -0.6, 0.5), target=(0.45, 0.0, 0.15), object_radius=self.leg_radius, object_height=0.01)
+
+    def value_plane(self, points: int) -> ValuePlane:
+        """V over x and height of the leg's end, in the plane through a hole in the middle of its range."""
+        x, z = np.meshgrid(np.linspace(LOW[0], HIGH[0], points), np.linspace(LOW[2], HIGH[2], points), indexing="ij")
+        middle = float(np.mean(self.hole_x)), float(np.mean(self.hole_y))
+        leg = np.stack([x.ravel(), np.full(x.size, middle[1]), z.ravel()], 1)
+        hole = np.tile([*middle, TOP - self.depth], (x.size, 1))
+        observation = np.concatenate([leg + [0, 0, BELOW], leg, hole], 1)
+        extent = (LOW[0], HIGH[0], LOW[2], HIGH[2])
+        return ValuePlane(observation, (points, points), extent, (("x", "m"), ("z", "m")), {"hole": (middle[0], TOP)})
+
+    def _joints(self, q: Array, place: Array) -> Array:
+        """Joint angles [N, 7] that bring the leg's end to a place [N, 3] m, the leg upright."""
+        return kinematics.inverse(q, place, REST, TCP + BELOW, upright=0.2)
