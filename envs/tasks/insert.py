@@ -14,7 +14,7 @@ REST = np.array([0.0, -0.1, 0.0, -2.3, 0.0, 2.2, 0.785])  # [rad]
 TOP = 0.10  # [m] height of the table above the robot's base
 START = 0.10  # [m] of the leg's end above the table, at the start
 WALLS = 12  # boxes around the hole
-WALL = 0.03  # [m] width of the rim
+WALL, EDGE = 0.05, 0.12  # [m] width of their ring, and from the hole to the table's edges
 LOW, HIGH = np.array([0.35, -0.15, TOP - 0.05]), np.array([0.65, 0.15, TOP + 0.2])  # [m] where the leg's end may go
 NSAMPLE = 500  # physics steps of command history that the model holds, so that a delay is a parameter
 
@@ -70,7 +70,7 @@ class Insert(AbstractTask):
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
         spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
         spec.worldbody.add_light(pos=[0.3, -0.6, 1.6], dir=[0, 0.35, -1], type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
-        spec.worldbody.add_camera(name="side", pos=[1.15, -0.85, 0.6], xyaxes=[0.75, 0.66, 0, -0.28, 0.32, 0.9])
+        spec.worldbody.add_camera(name="side", pos=[1.25, -0.95, 0.55], xyaxes=[0.776, 0.63, 0, -0.176, 0.217, 0.959])
         hand = fr3.add_fr3(spec, base=(0, 0, 0), tool_length=TCP, tool_radius=0.02)
         leg = hand.add_body(name="leg", pos=[0, 0, fr3.FLANGE + TCP], gravcomp=1)
         leg.add_geom(
@@ -93,17 +93,19 @@ class Insert(AbstractTask):
         return spec
 
     def _add_table(self, spec: mujoco.MjSpec) -> None:
-        """A round hole of boxes that stand around its floor."""
+        """A round hole of boxes that stand around its floor, in the middle of a square table."""
         table = add_fixture(spec, "table", "x y yaw")
-        radius = self.leg_radius * self.clearance
-        half = (radius + WALL) * np.tan(np.pi / WALLS)
-        angles = 2 * np.pi * np.arange(WALLS) / WALLS
-        shapes = [
-            ([WALL / 2, half, TOP / 2], [(radius + WALL / 2) * np.cos(a), (radius + WALL / 2) * np.sin(a), TOP / 2], a)
-            for a in angles
-        ]
-        floor = TOP - self.depth
-        for i, (size, place, angle) in enumerate([*shapes, ([radius, radius, floor / 2], [0, 0, floor / 2], 0.0)]):
+        radius, floor, top = self.leg_radius * self.clearance, TOP - self.depth, TOP / 2
+        across, half = radius + WALL / 2, (radius + WALL) * np.tan(np.pi / WALLS)
+        boxes = [([radius, radius, floor / 2], [0, 0, floor / 2], 0.0)]
+        for angle in 2 * np.pi * np.arange(WALLS) / WALLS:
+            boxes.append(([WALL / 2, half, top], [across * np.cos(angle), across * np.sin(angle), top], angle))
+        inner, low = 0.7 * (radius + WALL), top - 0.0002  # corners within the ring; a hair lower, so that one is seen
+        width, away = (EDGE - inner) / 2, (EDGE + inner) / 2
+        for side in (-1, 1):
+            boxes.append(([width, EDGE, low], [side * away, 0, low], 0.0))
+            boxes.append(([inner, width, low], [0, side * away, low], 0.0))
+        for i, (size, place, angle) in enumerate(boxes):
             table.add_geom(
                 name=f"table_{i}",
                 type=mujoco.mjtGeom.mjGEOM_BOX,

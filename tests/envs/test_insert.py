@@ -32,7 +32,7 @@ def test_beside_the_hole_is_the_table(make_backend) -> None:
     task = backend.task
 
     def aside(seen: np.ndarray) -> np.ndarray:
-        return task.scripted(seen + np.r_[np.zeros(6), 0.006, 0.0, 0.0])  # 5 times the play
+        return task.scripted(seen + np.r_[np.zeros(6), 0.02, 0.0, 0.0])
 
     seen = _seen(backend, aside)
     assert not task.success(seen).any() and (seen[:, 5] > 0.095).all()
