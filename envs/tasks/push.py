@@ -14,7 +14,7 @@ PUCK_RADIUS, PUCK_HALF_HEIGHT = 0.025, 0.015  # [m]
 TOOL_RADIUS, TOOL_LENGTH, TOOL_HEIGHT = 0.010, 0.15, 0.012  # [m]; the tip is kept this far above the table
 REACH = 0.78  # [m] from the base axis: beyond it the arm is stretched
 REST = np.array([0.0, -0.3, 0.0, -2.2, 0.0, 2.0, 0.785])  # [rad]
-TABLE_LOW, TABLE_HIGH = np.array([-0.15, -0.45]), np.array([0.75, 0.45])  # [m] edges of the table, task frame
+TABLE_LOW, TABLE_SIDE = np.array([-0.15, -0.45]), 0.45  # [m] edges of the table but the far one, task frame
 # [m] where the tip may be commanded, task frame
 WORKSPACE_LOW, WORKSPACE_HIGH = np.array([-0.08, -0.32]), np.array([0.56, 0.32])
 CONTACT = 0.035  # [m] tip to puck centre when they touch
@@ -29,6 +29,9 @@ class Push(AbstractTask):
     xy, or of joint targets with `control="joint"` (joints 1, 2 and 4). 5 Hz, 40 steps.
 
         r = -|tip - puck + (3.5 cm, 0)| - |puck_x - 55 cm| + 1[|puck_x - 55 cm| < 2.5 cm] - 1[puck fell]
+
+    The puck falls where its centre leaves the table, which ends at `edge_x`: in the paper with the goal line
+    (configs/task/push_edge.yaml), in `push` 20 cm beyond it.
 
     Success: the puck lies within 2.5 cm of the line when the episode ends, and has not left the table.
 
@@ -61,6 +64,7 @@ class Push(AbstractTask):
         start_noise: float,
         stray_share: float = 0.0,
         stray_x: tuple[float, float] = (0.0, 0.7),
+        edge_x: float = 0.75,
         origin: Sequence[float] = tuple(ORIGIN),
     ):
         if control not in ("cartesian", "joint"):
@@ -72,6 +76,7 @@ class Push(AbstractTask):
         self.goal_x, self.tolerance = goal_x, tolerance
         self.puck_x, self.puck_y, self.puck_mass, self.puck_friction = puck_x, puck_y, puck_mass, puck_friction
         self.start_noise, self.stray_share, self.stray_x = start_noise, stray_share, stray_x
+        self.table_high = np.array([edge_x, TABLE_SIDE])
         self.origin = np.array(origin, float)
         self._home: Array | None = None
 
@@ -91,8 +96,8 @@ class Push(AbstractTask):
         world.add_geom(
             name="table",
             type=mujoco.mjtGeom.mjGEOM_PLANE,
-            size=[*(TABLE_HIGH - TABLE_LOW) / 2, 0.05],
-            pos=[*(self.origin[:2] + (TABLE_LOW + TABLE_HIGH) / 2), self.origin[2]],
+            size=[*(self.table_high - TABLE_LOW) / 2, 0.05],
+            pos=[*(self.origin[:2] + (TABLE_LOW + self.table_high) / 2), self.origin[2]],
             rgba=[0.80, 0.74, 0.64, 1],
             contype=fr3.TABLE_BIT,
             conaffinity=0,
@@ -188,7 +193,7 @@ class Push(AbstractTask):
     def fell(self, observation: Array) -> NDArray[np.bool_]:
         """Whether the puck's centre is beyond the table's edge, [N]."""
         puck = observation[:, 2:]
-        return np.any((puck < TABLE_LOW) | (puck > TABLE_HIGH), axis=1)
+        return np.any((puck < TABLE_LOW) | (puck > self.table_high), axis=1)
 
     def success(self, observation: Array) -> NDArray[np.bool_]:
         return (np.abs(observation[:, 2] - self.goal_x) < self.tolerance) & ~self.fell(observation)

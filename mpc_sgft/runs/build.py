@@ -96,13 +96,14 @@ def load_agent(cfg: DictConfig) -> tuple[Agent, dict[str, Any]]:
         UserError: If the checkpoint is missing, corrupt, of another task, or of another size than a `model=` that was
             asked for.
     """
-    path = cfg.checkpoint if cfg.checkpoint is not None else shipped(cfg.chosen.task)
+    path = cfg.checkpoint if cfg.checkpoint is not None else shipped(agents_of(cfg))
+    tasks = [cfg.chosen.task, agents_of(cfg)]
     asked = any(text.startswith("model") for text in cfg.overrides)
     sizes = OmegaConf.to_container(cfg.model, resolve=True) if asked else {}
     assert isinstance(sizes, dict)
     sizes.pop("_target_", None)
     try:
-        loaded = checkpoint.load(path, task=cfg.chosen.task, sizes=sizes, device=device(cfg))  # type: ignore[arg-type]
+        loaded = checkpoint.load(path, tasks=tasks, sizes=sizes, device=device(cfg))  # type: ignore[arg-type]
     except checkpoint.CheckpointError as error:
         raise UserError(str(error)) from error
     for name in ("history", "discount"):
@@ -117,6 +118,11 @@ def load_agent(cfg: DictConfig) -> tuple[Agent, dict[str, Any]]:
             cfg.train.agent, model=loaded.model, seed=cfg.seed, device=device(cfg), discount=cfg.task.discount
         )
     return agent, loaded.meta
+
+
+def agents_of(cfg: DictConfig) -> str:
+    """The task whose pretrained agents this one takes, too: a variant of it has the same observations and actions."""
+    return cfg.task.get("agents_of") or cfg.chosen.task
 
 
 def check_fits(model: WorldModel, env: ControlEnv) -> None:

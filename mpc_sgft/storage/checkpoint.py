@@ -8,7 +8,7 @@ full disk or a kill leaves the earlier one.
 import hashlib
 import io
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -70,7 +70,7 @@ def save(path: Path | str, model: WorldModel, meta: Mapping[str, Any]) -> None:
 def load(
     path: Path | str,
     *,
-    task: str | None = None,
+    tasks: Sequence[str] = (),
     sizes: Mapping[str, Any] | None = None,
     device: torch.device | str = "cpu",
 ) -> Loaded:
@@ -78,7 +78,7 @@ def load(
 
     Args:
         path: File, or a run folder that holds checkpoint/model.safetensors.
-        task: Name of the task that it must have been trained for; None accepts any.
+        tasks: Names of the tasks for one of which it must have been trained; any if empty.
         sizes: Model sizes that it must have, e.g. {"obs_dim": 16}; others are free.
         device: Where the model goes.
 
@@ -100,7 +100,8 @@ def load(
         raise CheckpointError(f"{file} has no {err} in its header: it was not written by mpc_sgft. {_AGAIN}") from err
     except (SafetensorError, OSError, ValueError, TypeError) as err:
         raise CheckpointError(f"{file} is corrupt ({err}). {_AGAIN}") from err
-    expected = {"format": FORMAT, **({} if task is None else {"task": task}), **(sizes or {})}
+    own = meta["task"] if meta["task"] in tasks else next(iter(tasks), meta["task"])
+    expected = {"format": FORMAT, "task": own, **(sizes or {})}
     for key, value in expected.items():
         if found.get(key) != value:
             raise CheckpointError(

@@ -56,6 +56,12 @@ def test_push_rewards_by_hand(make_task) -> None:
     assert task.fell(seen).tolist() == [False, False, False, True]
 
 
+def test_a_puck_that_goes_too_far_falls_where_the_table_ends(make_task) -> None:
+    seen = np.array([[0.5, 0.0, 0.58, 0.0]])  # 5 mm past the goal line
+    still, fell = (make_task("push", edge_x=x).reward(seen, np.zeros((1, 2))) for x in (0.75, 0.575))
+    np.testing.assert_allclose(still - fell, 1.0)
+
+
 def test_pendulum_rewards_by_hand(make_task) -> None:
     task = make_task("pendulum")
     seen = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 2.0], [0.0, 1.0, 0.0]])

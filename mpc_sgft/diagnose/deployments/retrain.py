@@ -63,7 +63,7 @@ def pretrain_config(cfg: DictConfig, effects: Mapping[str, Any], folder: Path, t
     made = compose.compose("pretrain", [f"task={task}"], [])
     with open_dict(made):
         made.task, made.planner, made.seed, made.device = cfg.task, cfg.planner, cfg.seed, cfg.device
-        made.checkpoint = cfg.checkpoint if cfg.checkpoint is not None else str(build.shipped(task))
+        made.checkpoint = cfg.checkpoint if cfg.checkpoint is not None else str(build.shipped(build.agents_of(cfg)))
         made.gap.effects = dict(effects)
         made.chosen.gap = "+".join(["none", *effects])
         made.run_dir, made.quiet = str(folder), cfg.quiet

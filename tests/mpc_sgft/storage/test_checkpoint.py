@@ -30,7 +30,7 @@ def saved(path, residual=False):
 @pytest.mark.parametrize("residual", [False, True])
 def test_a_model_comes_back_bit_for_bit_with_its_header(tmp_path, residual):
     model = saved(tmp_path / "model.safetensors", residual)
-    loaded, meta = checkpoint.load(tmp_path / "model.safetensors", task="push", sizes={"obs_dim": 6})
+    loaded, meta = checkpoint.load(tmp_path / "model.safetensors", tasks=["edge", "push"], sizes={"obs_dim": 6})
     for (name, a), (other, b) in zip(model.state_dict().items(), loaded.state_dict().items(), strict=True):
         assert name == other and torch.equal(a, b)
     observation, action = torch.randn(4, 6), torch.zeros(4, 2)
@@ -47,7 +47,7 @@ def test_a_run_folder_stands_for_the_file_inside(tmp_path):
 @pytest.mark.parametrize(
     ("wanted", "message"),
     [
-        ({"task": "pendulum"}, "expected task='pendulum', found task='push'"),
+        ({"tasks": ["pendulum", "cart"]}, "expected task='pendulum', found task='push'"),
         ({"sizes": {"obs_dim": 9}}, "expected obs_dim=9, found obs_dim=6"),
         ({"sizes": {"latent_dim": 512}}, "expected latent_dim=512, found latent_dim=16"),
     ],
