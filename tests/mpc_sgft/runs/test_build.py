@@ -9,7 +9,8 @@ from mpc_sgft.runs import build
 
 def test_a_variant_of_a_task_takes_its_agents_and_another_task_does_not() -> None:
     cfg = compose.compose("evaluate", ["task=push_edge"], [])
-    assert cfg.task.env.edge_x == pytest.approx(cfg.task.env.goal_x + cfg.task.env.tolerance) and cfg.randomize.draws
+    assert cfg.task.env.edge_x == pytest.approx(cfg.task.env.goal_x + cfg.task.env.tolerance)
+    assert compose.compose("pretrain", ["task=push_edge"], []).randomize.draws
     _, meta = build.load_agent(cfg)
     assert meta["task"] == "push"
     with pytest.raises(UserError, match=r"no checkpoint is shipped for task 'hammer' \(shipped: push\)"):
