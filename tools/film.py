@@ -2,10 +2,12 @@
 
     MUJOCO_GL=egl python -m tools.film --out docs/adapt.gif
     MUJOCO_GL=egl python -m tools.film --run runs/push/latest --out adapt.gif
+    MUJOCO_GL=egl python -m tools.film --task hammer --gap hammer_real --out docs/tasks/hammer.gif
 
-Without --run it deploys as `make demo` does, but for three rollouts. The start is that of the first evaluation episode,
-whatever comes of it: the verdicts and the numbers in the captions are what was measured. MUJOCO_GL=egl draws without a
-screen (`make system` installs what that needs); leave it out where there is one.
+With --task it is the task's scripted policy, in simulation and in a gap. Without --task and --run it deploys as
+`make demo` does, but for three rollouts. The start is that of the first evaluation episode, whatever comes of it: the
+verdicts and the numbers in the captions are what was measured. MUJOCO_GL=egl draws without a screen (`make system`
+installs what that needs); leave it out where there is one.
 """
 
 import argparse
@@ -25,11 +27,13 @@ from PIL import Image, ImageDraw, ImageFont
 
 from envs.env import ControlEnv
 from envs.task import AbstractTask
+from mpc_sgft.command import compose
 from mpc_sgft.runs import build
-from mpc_sgft.runs.collect import Act, planner_policy
+from mpc_sgft.runs.collect import Act, collect, planner_policy, score, scripted_policy
 from mpc_sgft.runs.pretrain import EVAL_SEED
 
 ROLLOUTS = 3
+SCRIPTED = 64  # episodes that a scripted policy's success is counted in
 FRAMES_A_STEP = 2  # pictures of a control period
 HOLD = 2.5  # [s] that the last picture stays
 PANEL = (320, 316)  # [pixel] width and height of one picture
@@ -67,7 +71,19 @@ def episode(env: ControlEnv, act: Act, seed: int, steps: int) -> Episode:
     return Episode(np.concatenate(kept), bool(state["success"]))
 
 
-def draw(task: AbstractTask, qpos: NDArray[np.float64]) -> NDArray[np.uint8]:
+def camera_of(task: AbstractTask) -> mujoco.MjvCamera:
+    """The camera from where a viewer looks at the task."""
+    view, camera = task.view(), mujoco.MjvCamera()
+    if view.eye is None or view.target is None:
+        raise ValueError(f"task {task.name} says no view: give its view() an eye and a target")
+    along = np.subtract(view.target, view.eye)
+    camera.lookat, camera.distance = view.target, float(np.linalg.norm(along))
+    camera.azimuth = float(np.degrees(np.arctan2(along[1], along[0])))
+    camera.elevation = float(np.degrees(np.arcsin(along[2] / camera.distance)))
+    return camera
+
+
+def draw(task: AbstractTask, qpos: NDArray[np.float64], camera: mujoco.MjvCamera) -> NDArray[np.uint8]:
     """Pictures [n, height, width, 3] of positions [n, nq] in the task's scene, in front of a plain background."""
     spec = task.spec()
     rgb = np.array(BACKGROUND) / 255
@@ -81,8 +97,7 @@ def draw(task: AbstractTask, qpos: NDArray[np.float64]) -> NDArray[np.uint8]:
         height=8,
     )
     model = spec.compile()
-    data, camera = mujoco.MjData(model), mujoco.MjvCamera()
-    camera.lookat, camera.distance, camera.azimuth, camera.elevation = [0.47, 0.0, 0.04], 1.64, 122, -30
+    data = mujoco.MjData(model)
     with mujoco.Renderer(model, PANEL[1], PANEL[0]) as renderer:
         renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = False
         pictures = []
@@ -108,7 +123,7 @@ def frames(panels: list[Panel]) -> list[Image.Image]:
             pen.text((left + 10, 8), panel.title, INK, large)
             pen.text((left + 10, 30), panel.numbers, INK, small)
             if k == count - 1:
-                word, color = ("on the line", GOOD) if panel.success else ("missed the line", BAD)
+                word, color = ("done", GOOD) if panel.success else ("not done", BAD)
                 pen.text((left + PANEL[0] - 10, 42), word, color, large, anchor="rs")
             if i:
                 pen.line((left, 0, left, frame.height), INK, 1)
@@ -128,6 +143,29 @@ def save_gif(path: Path, pictures: list[Image.Image], seconds: float) -> None:
     flat[0].save(path, save_all=True, append_images=flat[1:], duration=durations, loop=0, optimize=True)
 
 
+def table_camera() -> mujoco.MjvCamera:
+    """Over the table of push, nearer than the viewer's."""
+    camera = mujoco.MjvCamera()
+    camera.lookat, camera.distance, camera.azimuth, camera.elevation = [0.47, 0.0, 0.04], 1.64, 122, -30
+    return camera
+
+
+def film_scripted(task: str, gap: str, out: Path) -> list[Episode]:
+    """Film the first evaluation episode of a task's scripted policy, in simulation and in a gap; return both."""
+    seen, panels, seconds = [], [], 0.0
+    for name, title in (("none", "In its simulator"), (gap, f"In {gap}")):
+        cfg = compose.compose("evaluate", [f"task={task}", f"gap={name}"], [])
+        build.prepare_process(cfg)
+        env, many = build.make_env(cfg, 1), build.make_env(cfg, SCRIPTED)
+        rate = score(collect(many, scripted_policy(many), seed=EVAL_SEED)).success
+        seen.append(episode(env, scripted_policy(env), EVAL_SEED, env.task.episode_steps))
+        numbers = f"scripted policy, {SCRIPTED} episodes: {rate:.0%}"
+        panels.append(Panel(draw(env.task, seen[-1].qpos, camera_of(env.task)), title, numbers, seen[-1].success))
+        seconds = env.task.episode_steps * env.task.control_dt
+    save_gif(out, frames(panels), seconds)
+    return seen
+
+
 def film(run: Path, out: Path) -> list[Episode]:
     """Film the first evaluation episode of a deployment, before and after; return both episodes."""
     cfg, summary = OmegaConf.load(run / "config.yaml"), json.loads((run / "summary.json").read_text())
@@ -141,7 +179,7 @@ def film(run: Path, out: Path) -> list[Episode]:
         model, planner = build.load_agent(settings)[0].model.eval(), build.make_planner(cfg, env.action_dim)
         seen.append(episode(env, planner_policy(model, planner, EVAL_SEED), EVAL_SEED, env.task.episode_steps))
         numbers = f"success in {summary['evaluation_episodes']} episodes: {curve[str(rollouts)]:.0%}"
-        panels.append(Panel(draw(env.task, seen[-1].qpos), title, numbers, seen[-1].success))
+        panels.append(Panel(draw(env.task, seen[-1].qpos, table_camera()), title, numbers, seen[-1].success))
     save_gif(out, frames(panels), env.task.episode_steps * env.task.control_dt)
     return seen
 
@@ -157,7 +195,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("docs/adapt.gif"))
     parser.add_argument("--run", type=Path, help="a run folder of deploy in simulation; default: one is made")
+    parser.add_argument("--task", help="film this task's scripted policy instead")
+    parser.add_argument("--gap", default="none", help="with --task: where its second half plays")
     args = parser.parse_args()
+    if args.task:
+        print(args.out, *(f"success {e.success}" for e in film_scripted(args.task, args.gap, args.out)))
+        return
     with tempfile.TemporaryDirectory() as scratch:
         run = args.run or Path(scratch) / "run"
         if args.run is None:

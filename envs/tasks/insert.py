@@ -168,8 +168,9 @@ class Insert(AbstractTask):
         inside = observation[:, 5] < TOP - 0.003
         down = np.where(inside | (aside < 0.5 * (self.clearance - 1) * self.leg_radius), -0.02, 0.0)
         hover = TOP + 0.004 - observation[:, 5]
-        dz = np.where(down < 0, down, np.where(inside, 0.0, hover))
-        return np.clip(np.concatenate([apart[:, :2], dz[:, None]], 1) / self.step_size, -1, 1)
+        dz = np.where(down < 0, np.maximum(down, apart[:, 2]), hover)
+        across = np.where(inside[:, None], 0.0, apart[:, :2])
+        return np.clip(np.concatenate([across, dz[:, None]], 1) / self.step_size, -1, 1)
 
     def points(self, observation: Array) -> dict[str, Array]:
         return {"tool": observation[..., 3:6], "object": observation[..., 6:9]}
@@ -178,7 +179,7 @@ class Insert(AbstractTask):
         return np.concatenate([qpos[:, 7:9], np.full((len(qpos), 1), TOP)], 1)
 
     def view(self) -> View:
-        return View(eye=(1.05, -0.6, 0.5), target=(0.45, 0.0, 0.15), object_radius=self.leg_radius, object_height=0.01)
+        return View(eye=(1.2, -0.8, 0.6), target=(0.4, 0.0, 0.22), object_radius=self.leg_radius, object_height=0.01)
 
     def value_plane(self, points: int) -> ValuePlane:
         """V over x and height of the leg's end, in the plane through a hole in the middle of its range."""

@@ -6,12 +6,13 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 from PIL import Image, ImageChops, ImageSequence
 
 from mpc_sgft.command import compose
 from mpc_sgft.runs import build
-from tools.film import BAR, FRAMES_A_STEP, PANEL, Panel, episode, frames, save_gif
+from tools.film import BAR, FRAMES_A_STEP, PANEL, Panel, camera_of, episode, frames, save_gif
 
 ROOT = Path(__file__).parents[2]
 
@@ -31,6 +32,15 @@ def test_an_episode_keeps_several_positions_of_each_step() -> None:
     assert seen.qpos.shape == (2 * FRAMES_A_STEP, env.backend.nominal.nq) and not seen.success
     assert (np.abs(np.diff(seen.qpos[:, :7], axis=0)).max(1) > 1e-3).all()  # the arm moves from picture to picture
     assert np.abs(seen.qpos[0, 7:] - again.qpos[0, 7:]).max() < 1e-6  # the puck starts at the same place
+
+
+@pytest.mark.parametrize("task", ["push", "hammer", "insert"])
+def test_the_camera_stands_where_the_task_says(task: str) -> None:
+    task_ = build.make_env(compose.compose("evaluate", [f"task={task}"], []), 1).task
+    camera = camera_of(task_)
+    azimuth, elevation = np.radians([camera.azimuth, camera.elevation])
+    ahead = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
+    np.testing.assert_allclose(camera.lookat - camera.distance * ahead, task_.view().eye, atol=1e-9)
 
 
 def test_captions_stand_above_the_pictures_and_the_verdict_on_the_last_one() -> None:
