@@ -2,14 +2,17 @@
 
 import mujoco
 
-HEAVY = 1e6  # [kg], [kg m^2]
+from envs.effects.passive import stiffen_dry_friction
+
+HEAVY = 1e4  # [kg], [kg m^2]; no more: at 1e8 rounding errors loosened the nail of hammer
+STUCK = 1e6  # [N], [N m] of dry friction, beyond all that an arm can do
 
 
 def add_fixture(spec: mujoco.MjSpec, name: str, axes: str) -> mujoco.MjsBody:
     """Add a body that may be put along some axes and stays there.
 
-    Its place is in qpos, so that each episode has its own without a model of its own; joints are so heavy that no blow
-    moves them.
+    Its place is in qpos, so that each episode has its own without a model of its own; joints are so heavy and stick so
+    well that no blow moves them.
 
     Args:
         spec: The scene to add to.
@@ -20,5 +23,7 @@ def add_fixture(spec: mujoco.MjSpec, name: str, axes: str) -> mujoco.MjsBody:
     for axis in axes.split():
         kind = mujoco.mjtJoint.mjJNT_HINGE if axis == "yaw" else mujoco.mjtJoint.mjJNT_SLIDE
         direction = [0, 0, 1] if axis == "yaw" else [float(axis == a) for a in "xyz"]
-        body.add_joint(name=f"{name}_{axis}", type=kind, axis=direction).armature = HEAVY
+        joint = body.add_joint(name=f"{name}_{axis}", type=kind, axis=direction)
+        joint.armature, joint.frictionloss = HEAVY, STUCK
+        stiffen_dry_friction(joint)
     return body

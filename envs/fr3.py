@@ -18,6 +18,7 @@ DH_A = np.array([0.0, 0.0, 0.0, 0.0825, -0.0825, 0.0, 0.088])  # [m], Craig's co
 DH_D = np.array([0.333, 0.0, 0.316, 0.0, 0.384, 0.0, 0.0])  # [m]
 DH_ALPHA = np.array([0.0, -1.0, 1.0, 1.0, -1.0, 1.0, 1.0]) * np.pi / 2  # [rad]
 FLANGE = 0.107  # [m] along the axis of joint 7
+TCP = 0.1034  # [m] from the flange to where the hand holds things
 LINK_MASS = np.array([2.9275, 2.9355, 2.2449, 2.6156, 2.3271, 1.8170, 0.6271])  # [kg]
 BASE_MASS = 2.3966  # [kg]
 ARMATURE = np.array([0.195, 0.195, 0.195, 0.195, 0.074, 0.074, 0.074])  # [kg m^2]
@@ -50,6 +51,29 @@ CAPSULES = (
 )
 JOINTS = tuple(f"joint{i}" for i in range(1, 8))
 WHITE, GREY, BLUE = [0.93, 0.94, 0.95, 1], [0.35, 0.37, 0.4, 1], [0.12, 0.36, 0.62, 1]
+
+
+def arm_scene(sim_dt: float) -> mujoco.MjSpec:
+    """An empty scene with what position-controlled arms and their contacts need, in steps of `sim_dt` [s]."""
+    spec = mujoco.MjSpec()
+    spec.compiler.degree = False
+    spec.option.timestep = sim_dt
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC  # the pyramid lets a puck slide 1.4 times too far on diagonals
+    return spec
+
+
+def allow_delays(spec: mujoco.MjSpec, steps: int) -> None:
+    """Give all actuators a zero delay and a vanishing lag, so that both are parameters of the model.
+
+    Args:
+        spec: The scene.
+        steps: Physics steps of command history, the longest delay.
+    """
+    for actuator in spec.actuators:
+        actuator.nsample, actuator.delay = steps, 0.0
+        actuator.dyntype, actuator.actearly = mujoco.mjtDyn.mjDYN_FILTEREXACT, 1
+        actuator.dynprm[0] = 1e-6
 
 
 def add_fr3(

@@ -9,8 +9,7 @@ from envs.effects.passive import stiffen_dry_friction
 from envs.fixture import add_fixture
 from envs.task import AbstractTask, Array, Start, ValuePlane, View, whole_steps
 
-TCP = 0.1034  # [m] from the flange to where the hand holds the handle
-HANDLE, FACE = 0.16, 0.03  # [m] from there to the head's axis, and from that down to its face
+HANDLE, FACE = 0.16, 0.03  # [m] from the hand to the head's axis, and from that down to its face
 HEAD_RADIUS, HANDLE_RADIUS = 0.015, 0.01  # [m]
 SWUNG = (1, 3, 5)  # joints that are commanded; the others hold the arm in a vertical plane
 REST = np.array([0.0, -0.93, 0.0, -2.0, 0.0, 1.08, 0.0])  # [rad] the face on a nail in the middle of the range
@@ -70,24 +69,17 @@ class Hammer(AbstractTask):
         self.hammer_mass, self.start_noise, self.aim = hammer_mass, start_noise, aim
 
     def spec(self) -> mujoco.MjSpec:
-        spec = mujoco.MjSpec()
-        spec.compiler.degree = False
-        spec.option.timestep = self.sim_dt
-        spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-        spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+        spec = fr3.arm_scene(self.sim_dt)
         spec.worldbody.add_light(pos=[0.3, -0.6, 1.8], dir=[0, 0.35, -1], type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
         spec.worldbody.add_camera(name="side", pos=[0.9, -1.35, 0.95], xyaxes=[0.85, 0.53, 0, -0.13, 0.21, 0.97])
-        self._add_hammer(fr3.add_fr3(spec, base=(0, 0, 0), tool_length=TCP, tool_radius=0.02))
-        for actuator in spec.actuators:  # a zero delay and a vanishing lag, so that both are parameters of the model
-            actuator.nsample, actuator.delay = NSAMPLE, 0.0
-            actuator.dyntype, actuator.actearly = mujoco.mjtDyn.mjDYN_FILTEREXACT, 1
-            actuator.dynprm[0] = 1e-6
+        self._add_hammer(fr3.add_fr3(spec, base=(0, 0, 0), tool_length=fr3.TCP, tool_radius=0.02))
+        fr3.allow_delays(spec, NSAMPLE)
         self._add_nail(spec)
         return spec
 
     def _add_hammer(self, hand: mujoco.MjsBody) -> None:
         """A handle across the hand, pointing forward, and a head with its axis along the hand's."""
-        hammer = hand.add_body(name="hammer", pos=[0, 0, fr3.FLANGE + TCP], gravcomp=1)
+        hammer = hand.add_body(name="hammer", pos=[0, 0, fr3.FLANGE + fr3.TCP], gravcomp=1)
         cylinder, capsule = mujoco.mjtGeom.mjGEOM_CYLINDER, mujoco.mjtGeom.mjGEOM_CAPSULE
         handle = hammer.add_geom(name="handle", type=capsule, size=[HANDLE_RADIUS, 0, 0], rgba=[0.55, 0.38, 0.2, 1])
         handle.fromto, handle.mass = [0, 0, 0, HANDLE, 0, 0], 0.3 * self.hammer_mass
@@ -151,7 +143,7 @@ class Hammer(AbstractTask):
         return placed
 
     def observe(self, qpos: Array, qvel: Array) -> Array:
-        hand = kinematics.tip_position(qpos[:, :7], TCP)
+        hand = kinematics.tip_position(qpos[:, :7], fr3.TCP)
         board_x, board_z, nail = qpos[:, 7:8], qpos[:, 8:9], qpos[:, 9:10]
         return np.concatenate([hand, qpos[:, SWUNG], qvel[:, SWUNG], board_z + nail, board_x, board_z - self.depth], 1)
 
@@ -208,7 +200,7 @@ class Hammer(AbstractTask):
 
     def _face(self, q: Array) -> Array:
         """x and z of the middle of the hammer's face, [N, 2] m, for the commanded joints [N, 3]."""
-        _, axes, hand = kinematics.chain(self._arm(q), TCP)
+        _, axes, hand = kinematics.chain(self._arm(q), fr3.TCP)
         down = axes[:, -1][:, [0, 2]]
         forward = np.stack([-down[:, 1], down[:, 0]], 1)
         return hand[:, [0, 2]] + HANDLE * forward + FACE * down

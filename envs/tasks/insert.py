@@ -8,8 +8,7 @@ from envs import fr3, kinematics
 from envs.fixture import add_fixture
 from envs.task import AbstractTask, Array, Start, ValuePlane, View, whole_steps
 
-TCP = 0.1034  # [m] from the flange to where the hand holds the leg
-BELOW = 0.08  # [m] from there to the leg's end
+BELOW = 0.08  # [m] from the hand to the leg's end
 REST = np.array([0.0, -0.1, 0.0, -2.3, 0.0, 2.2, 0.785])  # [rad]
 TOP = 0.10  # [m] height of the table above the robot's base
 START = 0.10  # [m] of the leg's end above the table, at the start
@@ -64,15 +63,11 @@ class Insert(AbstractTask):
         self._home: Array | None = None
 
     def spec(self) -> mujoco.MjSpec:
-        spec = mujoco.MjSpec()
-        spec.compiler.degree = False
-        spec.option.timestep = self.sim_dt
-        spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-        spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+        spec = fr3.arm_scene(self.sim_dt)
         spec.worldbody.add_light(pos=[0.3, -0.6, 1.6], dir=[0, 0.35, -1], type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
         spec.worldbody.add_camera(name="side", pos=[1.25, -0.95, 0.55], xyaxes=[0.776, 0.63, 0, -0.176, 0.217, 0.959])
-        hand = fr3.add_fr3(spec, base=(0, 0, 0), tool_length=TCP, tool_radius=0.02)
-        leg = hand.add_body(name="leg", pos=[0, 0, fr3.FLANGE + TCP], gravcomp=1)
+        hand = fr3.add_fr3(spec, base=(0, 0, 0), tool_length=fr3.TCP, tool_radius=0.02)
+        leg = hand.add_body(name="leg", pos=[0, 0, fr3.FLANGE + fr3.TCP], gravcomp=1)
         leg.add_geom(
             name="leg",
             type=mujoco.mjtGeom.mjGEOM_CYLINDER,
@@ -85,10 +80,7 @@ class Insert(AbstractTask):
             contype=fr3.OBJECT_BIT,
             conaffinity=0,
         )
-        for actuator in spec.actuators:  # a zero delay and a vanishing lag, so that both are parameters of the model
-            actuator.nsample, actuator.delay = NSAMPLE, 0.0
-            actuator.dyntype, actuator.actearly = mujoco.mjtDyn.mjDYN_FILTEREXACT, 1
-            actuator.dynprm[0] = 1e-6
+        fr3.allow_delays(spec, NSAMPLE)
         self._add_table(spec)
         return spec
 
@@ -142,7 +134,7 @@ class Insert(AbstractTask):
         return self._joints(previous_ctrl, target)
 
     def hold(self, qpos: Array) -> Array:
-        return kinematics.tip_position(qpos[:, :7], TCP + BELOW)
+        return kinematics.tip_position(qpos[:, :7], fr3.TCP + BELOW)
 
     def place(self, observation: Array, qpos: Array) -> Array:
         """The table where its hole is seen; its turn is not observed and left as it is."""
@@ -151,7 +143,7 @@ class Insert(AbstractTask):
         return placed
 
     def observe(self, qpos: Array, qvel: Array) -> Array:
-        hand, leg = (kinematics.tip_position(qpos[:, :7], length) for length in (TCP, TCP + BELOW))
+        hand, leg = (kinematics.tip_position(qpos[:, :7], length) for length in (fr3.TCP, fr3.TCP + BELOW))
         return np.concatenate([hand, leg, qpos[:, 7:9], np.full((len(qpos), 1), TOP - self.depth)], 1)
 
     def reward(self, observation: Array, action: Array) -> Array:
@@ -193,4 +185,4 @@ class Insert(AbstractTask):
 
     def _joints(self, q: Array, place: Array) -> Array:
         """Joint angles [N, 7] that bring the leg's end to a place [N, 3] m, the leg upright."""
-        return kinematics.inverse(q, place, REST, TCP + BELOW, upright=0.2)
+        return kinematics.inverse(q, place, REST, fr3.TCP + BELOW, upright=0.2)

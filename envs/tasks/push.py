@@ -81,13 +81,7 @@ class Push(AbstractTask):
         self._home: Array | None = None
 
     def spec(self) -> mujoco.MjSpec:
-        spec = mujoco.MjSpec()
-        spec.compiler.degree = False
-        spec.option.timestep = self.sim_dt
-        spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-        spec.option.cone = (
-            mujoco.mjtCone.mjCONE_ELLIPTIC
-        )  # the pyramid lets the puck slide 1.4 times too far on diagonals
+        spec = fr3.arm_scene(self.sim_dt)
         world = spec.worldbody
         world.add_light(pos=[0.3, -0.6, 1.6], dir=[0, 0.35, -1], type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
         world.add_camera(name="side", pos=[1.25, -1.05, 0.75], xyaxes=[0.68, 0.73, 0, -0.36, 0.33, 0.87])
@@ -112,10 +106,7 @@ class Push(AbstractTask):
             conaffinity=0,
         )
         fr3.add_fr3(spec, base=(0, 0, 0), tool_length=TOOL_LENGTH, tool_radius=TOOL_RADIUS)
-        for actuator in spec.actuators:  # a zero delay and a vanishing lag, so that both are parameters of the model
-            actuator.nsample, actuator.delay = NSAMPLE, 0.0
-            actuator.dyntype, actuator.actearly = mujoco.mjtDyn.mjDYN_FILTEREXACT, 1
-            actuator.dynprm[0] = 1e-6
+        fr3.allow_delays(spec, NSAMPLE)
         puck = world.add_body(name="puck", pos=[0.5, 0, self.origin[2] + PUCK_HALF_HEIGHT])
         puck.add_freejoint(name="puck")
         puck.add_geom(

@@ -29,7 +29,7 @@ from mpc_sgft.diagnose.fitting.prepare import Setup, leave_out_blocks, split
 from mpc_sgft.diagnose.fitting.screening import Effort
 from mpc_sgft.diagnose.fitting.search import search
 from mpc_sgft.diagnose.report import Report
-from mpc_sgft.diagnose.rows import Shown, candidate_rows, effect_rows, reduction, trace_rows, waterfall
+from mpc_sgft.diagnose.rows import Shown, candidate_rows, effect_rows, reduction, trace_rows, unit_of, waterfall
 from mpc_sgft.diagnose.verdict import repair
 from mpc_sgft.diagnose.verdict.relevance import repairs
 from mpc_sgft.diagnose.verdict.tolerance import Predict, Tolerance, limits_of
@@ -219,14 +219,9 @@ def assemble(
 
 def unit_at(model: mujoco.MjModel, term: Term, unit: str) -> str:
     """Of "N m or N", the one that belongs to the joints at which an effect is; both where they differ."""
-    turning, _, sliding = unit.partition(" or ")
-    joints = {model.joint(i).name: int(model.jnt_type[i]) for i in range(model.njnt)}
-    kinds = {joints[name] for name in term.at if name in joints} or {
-        joints[model.joint(int(i)).name] for i in model.actuator_trnid[:, 0]
-    }
-    if not sliding or len(kinds) > 1:
-        return unit
-    return sliding if kinds == {int(mujoco.mjtJoint.mjJNT_SLIDE)} else turning
+    named = [model.joint(name).id for name in term.at if name in {model.joint(i).name for i in range(model.njnt)}]
+    kinds = model.jnt_type[named or model.actuator_trnid[:, 0]]
+    return unit_of(unit, (kinds == int(mujoco.mjtJoint.mjJNT_SLIDE)).tolist())
 
 
 def errors_of(chain: Chain, y: Prediction) -> Array:

@@ -33,7 +33,7 @@ class Report:
     nominal: Array = field(repr=False)
     repaired: Array = field(repr=False)
     replayer: Replayer = field(repr=False)
-    laws: Laws = Laws()  # noqa: RUF009, it is a tuple
+    laws: Laws = field(default_factory=Laws)
     diff: str = ""
 
     @property

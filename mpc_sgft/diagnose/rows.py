@@ -34,6 +34,12 @@ class Shown(NamedTuple):
     unit: Callable[[Term, str], str] = lambda term, unit: unit
 
 
+def unit_of(unit: str, slides: Sequence[bool]) -> str:
+    """Of "N m or N", the one of joints that all turn or all slide; both where they differ or there are none."""
+    turning, _, sliding = unit.partition(" or ")
+    return unit if not sliding or len(set(slides)) != 1 else sliding if slides[0] else turning
+
+
 def effect_rows(
     setup: Setup[Any], verdict: Verdict, hypotheses: list[Hypothesis], shown: Shown
 ) -> list[dict[str, Any]]:

@@ -27,7 +27,7 @@ from mpc_sgft.diagnose.fitting.screening import key_of
 from mpc_sgft.diagnose.fitting.search import nearest, refit, search
 from mpc_sgft.diagnose.page.laws import missing_forces
 from mpc_sgft.diagnose.report import Report
-from mpc_sgft.diagnose.rows import Shown, candidate_rows, effect_rows, reduction, trace_rows, waterfall
+from mpc_sgft.diagnose.rows import Shown, candidate_rows, effect_rows, reduction, trace_rows, unit_of, waterfall
 from mpc_sgft.diagnose.simulation.plant import SHARP, Change, Plant, driven, joint_of
 from mpc_sgft.diagnose.simulation.replay import Replayer
 from mpc_sgft.diagnose.verdict import repair
@@ -239,10 +239,7 @@ def unit_at(plant: Plant, term: Term, unit: str) -> str:
         return _unit(plant, where)
     joint = where.removeprefix("qpos/")
     joint = joint_of(plant, joint) if joint in plant.actuators else joint
-    turning, _, sliding = unit.partition(" or ")
-    if not sliding or joint not in plant.joints:
-        return unit
-    return sliding if plant.axes()[joint].slide else turning
+    return unit_of(unit, [plant.axes()[joint].slide] if joint in plant.joints else [])
 
 
 def _unit(plant: Plant, signal: str) -> str:

@@ -83,6 +83,15 @@ def make_backend(make_task) -> Callable[..., SimBackend]:
     return make
 
 
+def first_and_last(backend: SimBackend, policy: Callable[[np.ndarray], np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """What is observed at the start and at the end of an episode, [N, O] each."""
+    backend.seed(0)
+    first = seen = backend.reset(np.arange(backend.num_envs))
+    for _ in range(backend.task.episode_steps):
+        seen = backend.send(policy(seen)).observation
+    return first, seen
+
+
 @pytest.fixture
 def make_env(make_backend) -> Callable[..., ControlEnv]:
     """make_env(task, num_envs, history=0, **as make_backend): a ControlEnv."""

@@ -1,28 +1,14 @@
 """The leg goes into the hole and nowhere else, in the simulator and in its reality."""
 
-from collections.abc import Callable
-
 import numpy as np
 import yaml
 
-from tests.envs.conftest import CONFIGS
-
-Policy = Callable[[np.ndarray], np.ndarray]
-
-
-def _seen(backend, policy: Policy) -> np.ndarray:
-    """What is observed at the end of an episode, [N, 9]."""
-    n = backend.num_envs
-    backend.seed(0)
-    seen = backend.reset(np.arange(n))
-    for _ in range(backend.task.episode_steps):
-        seen = backend.send(policy(seen)).observation
-    return seen
+from tests.envs.conftest import CONFIGS, first_and_last
 
 
 def test_the_leg_goes_in(make_backend) -> None:
     backend = make_backend("insert", 32)
-    seen = _seen(backend, backend.task.scripted)
+    _, seen = first_and_last(backend, backend.task.scripted)
     assert backend.task.success(seen).mean() >= 0.95
     assert (seen[:, 5] - seen[:, 8]).min() > -0.001, "the hole has a floor"
 
@@ -34,7 +20,7 @@ def test_beside_the_hole_is_the_table(make_backend) -> None:
     def aside(seen: np.ndarray) -> np.ndarray:
         return task.scripted(seen + np.r_[np.zeros(6), 0.02, 0.0, 0.0])
 
-    seen = _seen(backend, aside)
+    _, seen = first_and_last(backend, aside)
     assert not task.success(seen).any() and (seen[:, 5] > 0.095).all()
 
 
@@ -45,7 +31,7 @@ def test_the_real_one_can_be_done_by_who_knows_where_the_hole_is(make_backend) -
     rates = []
     for known in (0.0, 1.0):
         backend = make_backend("insert", 32, effects_=gap)
-        seen = _seen(backend, lambda s, known=known, task=backend.task: task.scripted(s - known * wrong))
+        _, seen = first_and_last(backend, lambda s, known=known, task=backend.task: task.scripted(s - known * wrong))
         rates.append(float(backend.task.success(seen - wrong).mean()))
     assert rates[0] < 0.5 and rates[1] > 0.85, rates
 

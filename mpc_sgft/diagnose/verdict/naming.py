@@ -102,14 +102,16 @@ def find_ties(
     """
     rivals = [e for e in hypotheses if 0 < e.effects <= best.effects and 0 < e.complexity and no_larger(e, best)]
     other = [e for e in rivals if sorted(e.names) != sorted(best.names) and not holds(e, best)]
-    pairs = [(e, e, best) for e in other] + [(e, with_all(e, best, there, hypotheses), there) for e in other]
-    worse = [
-        e
-        for e, rival, against in pairs
-        if rival and judge.ruled_out(rival.errors, against.errors, rng, log_odds(setup, against, rival))
-    ]
+
+    def beaten(e: Hypothesis, by: Hypothesis) -> bool:
+        return judge.ruled_out(e.errors, by.errors, rng, log_odds(setup, by, e))
+
+    def worse(e: Hypothesis) -> bool:
+        whole = with_all(e, best, there, hypotheses)
+        return beaten(e, best) or whole is not None and beaten(whole, there)
+
     other.sort(key=lambda e: e.error)
-    return [e for i, e in enumerate(other) if not any(e is w for w in worse) or i < NEAREST and alike(e.fit, best.fit)]
+    return [e for i, e in enumerate(other) if not worse(e) or i < NEAREST and alike(e.fit, best.fit)]
 
 
 def with_all(e: Hypothesis, best: Hypothesis, there: Hypothesis, hypotheses: list[Hypothesis]) -> Hypothesis | None:
