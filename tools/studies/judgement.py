@@ -1,18 +1,18 @@
 """What each number in the judgement of `diagnose` is worth: the verdicts of a benchmark's cases without it.
 
-    python -m tools.studies.judgement CASES [CASES ...] [--jobs 2] [--csv results/judgement/judgement.csv]
+    python -m tools.studies.judgement CASES [CASES ...] [--without A B+C ...] [--jobs 2] [--csv FILE]
 
 CASES are folders that `tools.studies.blind_benchmark` or `tools.studies.foreign_benchmark` made with --only generate,
 of seeds for development. Each case is searched once; then its sets are judged as they are, and once for each threshold
-with that threshold out of the way. The search keeps its own numbers. A row says how many answers were right, and how
-many differ from those as it is, in one folder.
+with that threshold out of the way, or with those that --without joins by a plus. The search keeps its own numbers. A
+row says how many answers were right, and how many differ from those as it is, in one folder.
 """
 
 import argparse
 import importlib
 import json
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
 from pathlib import Path
@@ -56,17 +56,18 @@ THRESHOLDS = (
 
 
 @contextmanager
-def idle(threshold: Threshold | None) -> Iterator[None]:
-    """The judgement without a threshold; as it is with None."""
-    modules = [importlib.import_module(f"mpc_sgft.diagnose.{m}") for m in threshold.modules] if threshold else []
-    before = [getattr(m, threshold.name) for m in modules] if threshold else []
+def idle(names: str) -> Iterator[None]:
+    """The judgement without thresholds, whose names a plus joins; as it is with none."""
+    chosen = [t for t in THRESHOLDS if t.name in names.split("+")]
+    places = [(importlib.import_module(f"mpc_sgft.diagnose.{m}"), t) for t in chosen for m in t.modules]
+    before = [getattr(module, t.name) for module, t in places]
     try:
-        for m in modules:
-            setattr(m, threshold.name, threshold.idle)  # pyright: ignore[reportOptionalMemberAccess]
+        for module, t in places:
+            setattr(module, t.name, t.idle)
         yield
     finally:
-        for m, value in zip(modules, before, strict=True):
-            setattr(m, threshold.name, value)  # pyright: ignore[reportOptionalMemberAccess]
+        for (module, t), value in zip(places, before, strict=True):
+            setattr(module, t.name, value)
 
 
 @contextmanager
@@ -126,23 +127,22 @@ def _values(f: Any) -> tuple[Any, ...]:
     return *(t.label for t in f.terms), *(v.tobytes() for v in f.values)
 
 
-def ablate(case: Path) -> dict[str, dict[str, Any]]:
-    """Reports of one case by threshold, "" as it is."""
+def ablate(case: Path, without: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """Reports of one case by what is out of the way."""
     from mpc_sgft.diagnose import diagnose
 
     files, out = sorted(case.glob("episode_*.csv")), {}
     with search_once():
-        for threshold in (None, *THRESHOLDS):
-            with idle(threshold):
-                report = diagnose(case / "model.xml", files, out=None, **known(case))
-                out[threshold.name if threshold else ""] = report.as_dict()
+        for names in without:
+            with idle(names):
+                out[names] = diagnose(case / "model.xml", files, out=None, **known(case)).as_dict()
     return out
 
 
 def rows(found: dict[str, dict[str, dict[str, Any]]], labels: dict[str, dict[str, Any]]) -> list[dict[str, Any]]:
-    """One row a threshold: shares of right and of wrong answers, and of how many."""
+    """One row for what is out of the way: shares of right and of wrong answers, and of how many."""
     out, fairly = [], {case: fair(labels[case]) for case in found}
-    for name in ["", *(t.name for t in THRESHOLDS)]:
+    for name in next(iter(found.values())):
         row: dict[str, Any] = {"without": name or "nothing"}
         for column, groups, count in COLUMNS:
             counted = [count(found[c][name], y) for c, y in fairly.items() if y["group"] in groups]
@@ -170,35 +170,50 @@ def _said(report: dict[str, Any]) -> tuple[str, list[str], list[list[str]]]:
 def main(argv: list[str]) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("cases", type=Path, nargs="+", help="folders of generated cases")
+    parser.add_argument("--without", nargs="+", metavar="A+B", default=[t.name for t in THRESHOLDS], type=_known)
     parser.add_argument("--jobs", type=int, default=2, help="processes (default 2)")
     parser.add_argument("--csv", type=Path, default=Path("results/judgement/judgement.csv"))
     args = parser.parse_args(argv)
-    table = []
+    table, without = [], ["", *args.without]
     try:
         hidden = {folder: cases.labels(folder) for folder in args.cases}
     except ValueError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     for folder, labels in hidden.items():
-        table += [{"cases": folder.name, **row} for row in rows(judged(folder, list(labels), args.jobs), labels)]
+        found = judged(folder, list(labels), without, args.jobs)
+        table += [{"cases": folder.name, **row} for row in rows(found, labels)]
         write_rows(args.csv, table)  # after each folder: they take long
     for row in table:
         print("  ".join(f"{k} {v}" for k, v in row.items()))
     return 0
 
 
-def judged(folder: Path, names: list[str], jobs: int) -> dict[str, dict[str, dict[str, Any]]]:
-    """Reports of a folder's cases by threshold; what is on disk is not done again."""
+def _known(names: str) -> str:
+    """Names of thresholds, joined by a plus.
+
+    Raises:
+        argparse.ArgumentTypeError: If there is no such threshold.
+    """
+    allowed = [t.name for t in THRESHOLDS]
+    for name in names.split("+"):
+        if name not in allowed:
+            raise argparse.ArgumentTypeError(f"{name} is no threshold; there are {', '.join(allowed)}")
+    return names
+
+
+def judged(folder: Path, names: list[str], without: list[str], jobs: int) -> dict[str, dict[str, dict[str, Any]]]:
+    """Reports of a folder's cases by what is out of the way; cases on disk that have all of them are not done again."""
     kept = folder / "judgement.jsonl"  # a case a line, so that a stopped run goes on
     found = dict(map(json.loads, kept.read_text().splitlines())) if kept.is_file() else {}
-    todo = [name for name in names if name not in found]
+    todo = [name for name in names if not {*without} <= {*found.get(name, ())}]
     with ProcessPoolExecutor(jobs) as pool, kept.open("a") as file:
-        futures = {pool.submit(ablate, folder / "cases" / name): name for name in todo}
+        futures = {pool.submit(ablate, folder / "cases" / name, without): name for name in todo}
         for future in tqdm(as_completed(futures), total=len(todo), desc=f"judge {folder.name}", unit="case"):
             found[futures[future]] = future.result()
             file.write(json.dumps([futures[future], found[futures[future]]]) + "\n")
             file.flush()
-    return {name: found[name] for name in names}
+    return {name: {w: found[name][w] for w in without} for name in names}
 
 
 if __name__ == "__main__":
