@@ -19,7 +19,7 @@ class ContactFriction(Effect):
     bounds: ClassVar[dict[str, tuple[float, float]]] = {"coefficient": (0.0, 10.0)}
 
     def edit_spec(self, spec: mujoco.MjSpec) -> None:
-        for geom in pick(spec.geoms, self.at, "geom"):
+        for geom in pick([*spec.geoms, *spec.flexes], self.at, "geom"):
             geom.friction[0] = self.coefficient
             geom.priority = max(geom.priority, 1)
 

@@ -44,6 +44,7 @@ class Push(AbstractTask):
     name = "push"
     observation_names = ("tip_x", "tip_y", "puck_x", "puck_y")
     arm_joints = (0, 1, 3)  # commanded with control="joint"
+    puck_dof = 6
     arm = Arm(rest=REST, tool_length=TOOL_LENGTH)
 
     def __init__(
@@ -107,7 +108,11 @@ class Push(AbstractTask):
         )
         fr3.add_fr3(spec, base=(0, 0, 0), tool_length=TOOL_LENGTH, tool_radius=TOOL_RADIUS)
         fr3.allow_delays(spec, NSAMPLE)
-        puck = world.add_body(name="puck", pos=[0.5, 0, self.origin[2] + PUCK_HALF_HEIGHT])
+        self._add_puck(spec)
+        return spec
+
+    def _add_puck(self, spec: mujoco.MjSpec) -> None:
+        puck = spec.worldbody.add_body(name="puck", pos=[0.5, 0, self.origin[2] + PUCK_HALF_HEIGHT])
         puck.add_freejoint(name="puck")
         puck.add_geom(
             name="puck",
@@ -120,7 +125,6 @@ class Push(AbstractTask):
             contype=fr3.OBJECT_BIT,
             conaffinity=fr3.TABLE_BIT,
         )
-        return spec
 
     def home(self) -> Array:
         """Joint angles [1, 7] with the tip behind every puck start; computed once."""
@@ -136,10 +140,15 @@ class Push(AbstractTask):
         q = kinematics.inverse(self.home(), self._tip_target(xy), REST, TOOL_LENGTH)
         strays = self.stray_share > 0 and rng.uniform() < self.stray_share
         puck_x = self.stray_x if strays else self.puck_x
-        puck = self.origin + [rng.uniform(*puck_x), rng.uniform(*self.puck_y), PUCK_HALF_HEIGHT]
-        yaw = rng.uniform(-np.pi, np.pi)
-        qpos = np.concatenate([q[0], puck, [np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)]])[None]
-        return Start(qpos=qpos, qvel=np.zeros((1, 13)), target=xy if self.control == "cartesian" else q)
+        puck = np.array([[rng.uniform(*puck_x), rng.uniform(*self.puck_y)]])
+        puck = self._lying(puck, np.array([rng.uniform(-np.pi, np.pi)]))
+        velocities = np.zeros((1, 7 + self.puck_dof))
+        return Start(np.concatenate([q, puck], 1), velocities, xy if self.control == "cartesian" else q)
+
+    def _lying(self, xy: Array, yaw: Array) -> Array:
+        """Joint positions of a puck that lies on the table at a place [N, 2] m, turned by a yaw [N] rad."""
+        turn = np.stack([np.cos(yaw / 2), 0 * yaw, 0 * yaw, np.sin(yaw / 2)], 1)
+        return np.concatenate([xy + self.origin[:2], np.full((len(xy), 1), self.origin[2] + PUCK_HALF_HEIGHT), turn], 1)
 
     def move(self, target: Array, action: Array) -> Array:
         if self.control == "cartesian":
@@ -166,14 +175,11 @@ class Push(AbstractTask):
 
     def place(self, observation: Array, qpos: Array) -> Array:
         """The puck lies flat where it is seen; its turn about the vertical is not observed and left at zero."""
-        placed = qpos.copy()
-        placed[:, 7:14] = [0, 0, self.origin[2] + PUCK_HALF_HEIGHT, 1, 0, 0, 0]
-        placed[:, 7:9] = observation[:, 2:4] + self.origin[:2]
-        return placed
+        return np.concatenate([qpos[:, :7], self._lying(observation[:, 2:4], np.zeros(len(qpos)))], 1)
 
     def observe(self, qpos: Array, qvel: Array) -> Array:
         tip = kinematics.tip_position(qpos[:, :7], TOOL_LENGTH)
-        return np.concatenate([tip[:, :2], qpos[:, 7:9]], 1) - np.tile(self.origin[:2], 2)
+        return np.concatenate([tip[:, :2], self.place_of(qpos)[:, :2]], 1) - np.tile(self.origin[:2], 2)
 
     def reward(self, observation: Array, action: Array) -> Array:
         tip, puck = observation[:, :2], observation[:, 2:]

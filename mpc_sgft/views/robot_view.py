@@ -1,4 +1,4 @@
-"""A MuJoCo model as rerun entities: its shapes once, its bodies' poses as columns."""
+"""A MuJoCo model as rerun entities: its shapes once, its bodies' poses and what is soft as columns."""
 
 import copy
 
@@ -27,11 +27,17 @@ class RobotView:
         self._recording = recording
         self._model = model
         self._data = mujoco.MjData(model)
+        self._path, self._opacity = path, opacity
         self._logger = MJCFLogger(drawable(model), path, opacity=opacity)
 
     def log_shapes(self) -> None:
         """Log the geometry at the recording's current time."""
         self._logger.log_model(self._recording)
+        for flex in range(self._model.nflex):
+            color = self._model.flex_rgba[flex].copy()
+            color[3] = color[3] if self._opacity is None else self._opacity
+            mesh = rr.Mesh3D.from_fields(triangle_indices=triangles(self._model, flex), albedo_factor=color)
+            self._recording.log(self._flex_path(flex), mesh, static=True)
 
     def log_poses(self, indexes: list[rr.TimeColumn], qpos: np.ndarray) -> None:
         """Log where every body is, qpos [R, nq], one row of the indexes each.
@@ -43,15 +49,35 @@ class RobotView:
             raise ValueError(f"qpos must be [rows, {self._model.nq}] for this model, got {qpos.shape}.")
         position = np.empty((len(qpos), self._model.nbody, 3))
         quaternion = np.empty((len(qpos), self._model.nbody, 4))
+        vertices = np.empty((len(qpos), self._model.nflexvert, 3))
         for row, q in enumerate(qpos):
             self._data.qpos[:] = q
             mujoco.mj_kinematics(self._model, self._data)
+            mujoco.mj_flex(self._model, self._data)
             position[row], quaternion[row] = self._data.xpos, self._data.xquat
+            vertices[row] = self._data.flexvert_xpos
         quaternion = np.roll(quaternion, -1, axis=-1)  # MuJoCo has w first, rerun last
         for body in range(1, self._model.nbody):
             name = self._model.body(body).name or f"body_{body}"
             columns = rr.Transform3D.columns(translation=position[:, body], quaternion=quaternion[:, body])
             self._recording.send_columns(self._logger.paths.body_path(name), indexes, columns)
+        for flex in range(self._model.nflex):
+            start, count = self._model.flex_vertadr[flex], self._model.flex_vertnum[flex]
+            moved = rr.Mesh3D.columns(vertex_positions=vertices[:, start : start + count].reshape(-1, 3))
+            self._recording.send_columns(self._flex_path(flex), indexes, moved.partition([count] * len(qpos)))
+
+    def _flex_path(self, flex: int) -> str:
+        return f"{self._path}/flexes/{mujoco.mj_id2name(self._model, mujoco.mjtObj.mjOBJ_FLEX, flex) or flex}"
+
+
+def triangles(model: mujoco.MjModel, flex: int) -> np.ndarray:
+    """Vertices of each triangle of a sheet, or of a solid's skin, [F, 3]; of a flex of lines none."""
+    if model.flex_dim[flex] == 1:
+        return np.empty((0, 3), np.int32)
+    all_, start, count = model.flex_elem, model.flex_elemdataadr[flex], model.flex_elemnum[flex]
+    if model.flex_dim[flex] == 3:
+        all_, start, count = model.flex_shell, model.flex_shelldataadr[flex], model.flex_shellnum[flex]
+    return all_[start : start + 3 * count].reshape(-1, 3)
 
 
 def drawable(model: mujoco.MjModel) -> mujoco.MjModel:

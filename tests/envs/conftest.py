@@ -25,7 +25,12 @@ def make_task() -> Callable[..., Any]:
     """make_task(name, **changes): a task with the numbers of configs/task/<name>.yaml."""
 
     def make(name: str, **changes: Any) -> Any:
-        numbers = yaml.safe_load((CONFIGS / f"task/{name}.yaml").read_text())["env"] | changes
+        own = yaml.safe_load((CONFIGS / f"task/{name}.yaml").read_text())
+        parents = [p for p in own.get("defaults", []) if p != "_self_"]
+        numbers = {}
+        for said in (*(yaml.safe_load((CONFIGS / f"task/{p}.yaml").read_text()) for p in parents), own):
+            numbers |= said["env"]
+        numbers |= changes
         module, kind = numbers.pop("_target_").rsplit(".", 1)
         return getattr(importlib.import_module(module), kind)(**numbers)
 

@@ -11,6 +11,7 @@ from rerun.chunk import RrdReader
 
 from mpc_sgft.views.blueprint import Layout, camera
 from mpc_sgft.views.episode_view import Candidates, EpisodeView
+from mpc_sgft.views.robot_view import triangles
 from mpc_sgft.views.value_image import viridis
 from mpc_sgft.views.viewer import RunViewer
 from tools.screenshot import open_viewer, reports, set_time
@@ -162,6 +163,27 @@ def test_the_robot_stands_where_mujoco_says(tmp_path, arm):
         assert np.allclose(lower["Transform3D:translation"][index][0], data.body("lower").xpos, atol=1e-6)
         x, y, z, w = lower["Transform3D:quaternion"][index][0]
         assert np.allclose([w, x, y, z], data.body("lower").xquat, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "kind, faces", [('type="grid" dim="2" count="3 3 1"', 8), ('type="grid" dim="3" count="2 2 2"', 12)]
+)
+def test_what_is_soft_is_drawn_as_it_bends(tmp_path, kind, faces):
+    model = mujoco.MjModel.from_xml_string(
+        f'<mujoco><worldbody><flexcomp name="soft" {kind} spacing=".1 .1 .1" radius=".01"/></worldbody></mujoco>'
+    )
+    qpos = np.random.default_rng(0).normal(size=(T + 1, model.nq)) * 0.02
+    view = episode(model=None, object=None, imagined_object=None, qpos=qpos, candidates=())
+    with RunViewer(tmp_path / "run.rrd", model, control_dt=0.05, layout=Layout(value_maps=())) as viewer:
+        viewer.episode(view)
+    soft, data = columns(tmp_path / "run.rrd")["/world/robot/flexes/soft"], mujoco.MjData(model)
+    drawn = [v for v in soft["Mesh3D:vertex_positions"] if v]
+    assert len(drawn) == T + 1
+    for q, vertices in zip(qpos, drawn, strict=True):
+        data.qpos[:] = q
+        mujoco.mj_forward(model, data)
+        assert np.allclose(vertices, data.flexvert_xpos, atol=1e-6)
+    assert triangles(model, 0).shape == (faces, 3) and triangles(model, 0).max() == model.nflexvert - 1
 
 
 def test_the_ghost_is_what_was_imagined_one_step_before(tmp_path):
