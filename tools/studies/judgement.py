@@ -37,17 +37,12 @@ class Threshold(NamedTuple):
 
 JUDGE, NAMING = ("fitting.judge",), ("verdict.naming",)
 THRESHOLDS = (
-    Threshold("MIN_GAIN", JUDGE, 0.0),
     Threshold("MIN_SHARE", JUDGE, 0.0),
-    Threshold("TIE_GAIN", JUDGE, 0.0),
     Threshold("TIE_ODDS", JUDGE, 1.0),
     Threshold("SURE_ODDS", JUDGE, float("inf")),
     Threshold("FEW", JUDGE, 0.0),
     Threshold("ELSEWHERE", JUDGE, -float("inf")),
     Threshold("NEAR", JUDGE, 0.0),
-    Threshold("FIRST_GAIN", NAMING, 0.05),  # as other gains
-    Threshold("NEXT_GAIN", NAMING, 0.05),
-    Threshold("RICHER_SHARE", NAMING, 1.0),
     Threshold("WIDER", NAMING, 1.0),
     Threshold("LEFT", ("verdict.verdict",), 1.0),
     Threshold("MATTERS", ("verdict.verdict", "verdict.relevance"), 0.0),

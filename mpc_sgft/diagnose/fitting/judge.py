@@ -12,15 +12,12 @@ from mpc_sgft.diagnose.data.measured import Array
 RESAMPLES = 1000
 GAIN_LEVEL = 0.98  # a larger structure must be better with this confidence ...
 TIE_LEVEL = 0.90  # ... while a rival of the same size must be worse with this one, or it ties
-TIE_GAIN = 0.01  # ... by more than this in log(1 + e)
 TIE_ODDS = 20.0  # ... or, where what is left is noise, be so much less likely
 SURE_ODDS = 1000.0  # so much likelier, where what is left is noise, needs no confidence: a few windows give none
 FEW = 12  # windows
-MIN_GAIN = 0.05  # in log(1 + e): a gain below is not worth a name ...
-MIN_SHARE = 0.05  # ... nor one below this share of the error
+MIN_SHARE = 0.05  # of the error in log(1 + e): a gain below is not worth a name
 NEAR = 1.0  # in squares of noise: less above it is not much, whatever its share
-ELSEWHERE_SHARE = 0.4  # of the gain that matters, or
-ELSEWHERE = 0.02  # in log(1 + e), left of a gain without its best window: one window may have gone wrong by itself
+ELSEWHERE = 0.4  # of the gain that matters, left without the best window: one window may have gone wrong by itself
 
 
 class Interval(NamedTuple):
@@ -52,7 +49,7 @@ def gain(worse: Array, better: Array, level: float, rng: np.random.Generator) ->
 
 def least_gain(error: float) -> float:
     """The smallest drop of an error, in log(1 + e), that is worth a name."""
-    return max(MIN_GAIN, MIN_SHARE * error)
+    return MIN_SHARE * error
 
 
 def leaves_much(error: float, nominal: float, share: float) -> bool:
@@ -70,7 +67,6 @@ def credible(
     better: Array,
     rng: np.random.Generator,
     parts: int = 1,
-    least: float | None = None,
     one_window: bool = False,
     log_odds: float | None = None,
 ) -> bool:
@@ -80,16 +76,15 @@ def credible(
         worse, better: Errors of the same parts of the same windows, [W parts].
         rng: For the bootstrap.
         parts: Of each window.
-        least: Gain that matters, in log(1 + e); what is worth a name if None.
         one_window: Whether several parts of one window will do.
         log_odds: Logarithm of how much likelier the data are with the better one; None where that is not known.
     """
     g = gain(worse, better, 2 * GAIN_LEVEL - 1, rng)
     drops = (worse - better).reshape(-1, 1 if one_window else parts).mean(1)
     elsewhere = (drops.sum() - drops.max()) / max(len(drops) - 1, 1)
-    least = least_gain(float(worse.mean())) if least is None else least
+    least = least_gain(float(worse.mean()))
     real = g.low > 0 or log_odds is not None and log_odds > np.log(SURE_ODDS)
-    return real and g.mean > least and bool(elsewhere > min(ELSEWHERE, ELSEWHERE_SHARE * least))
+    return real and g.mean > least and bool(elsewhere > ELSEWHERE * least)
 
 
 def ruled_out(rival: Array, best: Array, rng: np.random.Generator, log_odds: float | None = None) -> bool:
@@ -101,7 +96,7 @@ def ruled_out(rival: Array, best: Array, rng: np.random.Generator, log_odds: flo
         log_odds: Logarithm of how much likelier the data are with the best; None where that is not known.
     """
     g = gain(rival, best, 2 * TIE_LEVEL - 1, rng)
-    return g.mean > TIE_GAIN and bool(g.low > 0 if log_odds is None else log_odds > np.log(TIE_ODDS))
+    return bool(g.low > 0 if log_odds is None else log_odds > np.log(TIE_ODDS))
 
 
 def win_shares(errors: Array, complexity: Array, rng: np.random.Generator, points: int) -> Array:

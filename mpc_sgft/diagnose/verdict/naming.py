@@ -16,9 +16,6 @@ from mpc_sgft.diagnose.fitting.fit import Fit
 from mpc_sgft.diagnose.fitting.hypothesis import Hypothesis, holds, without_effect
 from mpc_sgft.diagnose.fitting.prepare import ABOVE_NOISE, NOISE, Setup
 
-FIRST_GAIN = 0.025  # in log(1 + e), of the only effect where the nominal model leaves noise alone
-NEXT_GAIN = 0.06  # in log(1 + e), of one more effect where noise alone is left
-RICHER_SHARE = 0.2  # of what is worth a name, of a richer effect in place of one that it includes
 NEAREST = 8  # rivals that are simulated to see whether they foretell the same
 WIDER = 1.3  # of intervals: what windows that begin at each other's ends share; set on development seeds
 
@@ -40,19 +37,11 @@ def choose(setup: Setup[Any], hypotheses: list[Hypothesis], rng: np.random.Gener
 
 
 def gains(setup: Setup[Any], small: Hypothesis, large: Hypothesis, rng: np.random.Generator) -> bool:
-    """Whether a larger set is credibly better; where noise alone is left, one more effect must gain more.
-
-    A richer effect in place of a simpler one is no further cause, and gains nothing where the simpler one is the truth.
-    """
-    least = judge.least_gain(small.error)
-    if holds(large, small):
-        least *= RICHER_SHARE
-    elif small.effects and settled(small):
-        least = NEXT_GAIN
-    elif not small.effects and small.error < setup.quiet:
-        least = FIRST_GAIN
+    """Whether a larger set is credibly better."""
     likelier = log_odds(setup, large, small) if settled(small) else None
-    return judge.credible(small.errors, large.errors, rng, setup.parts, least, setup.one_window(large.errors), likelier)
+    return judge.credible(
+        small.errors, large.errors, rng, setup.parts, setup.one_window(large.errors), log_odds=likelier
+    )
 
 
 def surely_there(setup: Setup[Any], small: Hypothesis, large: Hypothesis) -> bool:

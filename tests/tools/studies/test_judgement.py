@@ -22,16 +22,16 @@ def test_a_threshold_is_idle_for_a_while(threshold: Threshold) -> None:
 
 def test_thresholds_are_idle_together() -> None:
     judge, naming = (importlib.import_module(f"mpc_sgft.diagnose.{m}") for m in ("fitting.judge", "verdict.naming"))
-    before = judge.MIN_GAIN, judge.TIE_ODDS, naming.WIDER
-    with idle("MIN_GAIN+WIDER"):
-        assert (judge.MIN_GAIN, judge.TIE_ODDS, naming.WIDER) == (0.0, before[1], 1.0)
-    assert (judge.MIN_GAIN, judge.TIE_ODDS, naming.WIDER) == before
+    before = judge.MIN_SHARE, judge.TIE_ODDS, naming.WIDER
+    with idle("MIN_SHARE+WIDER"):
+        assert (judge.MIN_SHARE, judge.TIE_ODDS, naming.WIDER) == (0.0, before[1], 1.0)
+    assert (judge.MIN_SHARE, judge.TIE_ODDS, naming.WIDER) == before
 
 
 def test_a_threshold_that_is_none_is_named(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
-        judgement.main(["cases", "--without", "MIN_GAIN+MIN_LUCK"])
-    assert "MIN_LUCK is no threshold; there are MIN_GAIN" in capsys.readouterr().err
+        judgement.main(["cases", "--without", "MIN_SHARE+MIN_LUCK"])
+    assert "MIN_LUCK is no threshold; there are MIN_SHARE" in capsys.readouterr().err
 
 
 def test_a_case_is_searched_once(monkeypatch: pytest.MonkeyPatch) -> None:
