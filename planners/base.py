@@ -13,7 +13,14 @@ PRECISIONS = ("auto", "float32", "bfloat16")  # of a model's matrix products
 
 
 class Model(Protocol):
-    """A learned world. Every method takes any leading batch dimensions [...]; a class satisfies it by having them."""
+    """A learned world. Every method takes any leading batch dimensions [...]; a class satisfies it by having them.
+
+    Attributes:
+        value_range: How far apart the values of good and of bad states are, reward units, above 0. Planners measure
+            values by it, so that the same settings serve tasks whose rewards are large or small.
+    """
+
+    value_range: float
 
     def next(self, z: Tensor, action: Tensor) -> Tensor:
         """Latent after `action` [..., A] in latent `z` [..., D]: [..., D]."""

@@ -14,16 +14,18 @@ class MPPI(SamplingPlanner):
 
         w_k = exp((v_k - max v) / λ) / Σ_j exp((v_j - max v) / λ)
 
-    temperature is λ > 0, reward units: it divides the value, so cold picks the best elite and hot averages all of them.
+    temperature is λ > 0, a share of the model's `value_range`: it divides the value, so cold picks the best elite and
+    hot averages all of them.
 
     Raises:
         ValueError: From the constructor, if a number is out of range.
 
     Source: Williams et al., Information theoretic MPC, ICRA 2017; elites and policy-prior candidates as in TD-MPC2,
-    arXiv:2310.16828, where the temperature multiplies: its 0.5 is our 2.0.
+    arXiv:2310.16828, where the temperature multiplies the value in reward units. The value range is ours, after the
+    running scale by which TD-MPC2 divides values in the loss of its policy.
     """
 
-    temperature: float = 2.0
+    temperature: float = 0.1
 
     def __post_init__(self) -> None:
         super().__post_init__()

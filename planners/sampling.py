@@ -63,7 +63,7 @@ class SamplingPlanner(ABC):
 
     @abstractmethod
     def weights(self, values: Tensor) -> Tensor:
-        """Weight of every elite from its value, [B, K]; they sum to one."""
+        """Weight of every elite from its value in units of the value range, [B, K]; they sum to one."""
 
     @torch.inference_mode()
     def plan(
@@ -112,7 +112,7 @@ class SamplingPlanner(ABC):
             pool[:, prior:] = torch.addcmul(mean.unsqueeze(1), std.unsqueeze(1), noise).clamp_(-1, 1)
             values[:, prior:] = returns(pool[:, prior:])
             check_finite(who, "candidate values", values)
-            mean, std = self.refit(pool, values)
+            mean, std = self.refit(pool, values / model.value_range)
         check_finite(who, "planned actions", mean)
         value = h_step_return(model, z, mean.unsqueeze(1), self.discount).squeeze(1)
         check_finite(who, "values of the plan", value)
@@ -124,7 +124,10 @@ class SamplingPlanner(ABC):
         return Plan(action, mean, std, value, *kept)
 
     def refit(self, pool: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean and clamped std of the elites, each [B, H, A], from candidates [B, N, H, A] and their values [B, N]."""
+        """Mean and clamped std of the elites, each [B, H, A], from candidates [B, N, H, A] and their values [B, N].
+
+        Values are in units of the model's `value_range`.
+        """
         top, index = values.topk(self.num_elites, dim=1)
         elites = pool.gather(1, index[..., None, None].expand(-1, -1, *pool.shape[2:]))  # [B, K, H, A]
         weight = self.weights(top)[..., None, None]

@@ -7,10 +7,11 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from torch import Tensor
+from torch import Tensor, nn
 
 from mpc_sgft.learning import losses
 from mpc_sgft.learning.averaged import AveragedWeights
+from mpc_sgft.learning.layers import by_blocks
 from mpc_sgft.learning.precision import dtype_of_products, in_own_precision
 from mpc_sgft.learning.slices import FiniteWatch, Slices, arranged, check_finite, floats, to_slices
 from mpc_sgft.learning.world_model import WorldModel
@@ -252,6 +253,7 @@ class Agent:
         rho: float,
         weight: Tensor | None = None,
         penalty: tuple[str, float, Callable[[], Tensor]] | None = None,
+        simulated: nn.Module | None = None,
     ) -> tuple[dict[str, Tensor], Tensor]:
         """One step of the dynamics toward the encoded observations; encoder and observations stay as they are.
 
@@ -260,6 +262,9 @@ class Agent:
             rho: Weight of imagined step t is rho^t.
             weight: Of each slice, [B], mean one; None weighs all alike.
             penalty: Name, weight and value of what is added to the loss, worked out after it.
+            simulated: The simulator's dynamics with the same command map. If given, the map learns what it can explain
+                of the data together with these, and the dynamics learn the rest with the map as it is. Learned at
+                once, a growing map and shrinking dynamics explain the same data, and neither holds elsewhere.
 
         Returns:
             Metrics, and the encoded observations, [T + 1, B, D].
@@ -269,16 +274,25 @@ class Agent:
         """
         with torch.no_grad():
             encoded = self.model.encode(data.observation)  # [T + 1, B, D]
-        zs = self._imagine(encoded[0], data.action)
-        loss = losses.over_time(losses.consistency_loss(zs[1:], encoded[1:]), rho, weight)
+
+        def error(dynamics: nn.Module) -> Tensor:
+            zs = self._imagine(encoded[0], data.action, dynamics)
+            return losses.over_time(losses.consistency_loss(zs[1:], encoded[1:]), rho, weight)
+
+        loss = error(self.model.dynamics)
         metrics = {"consistency_loss": loss}
+        if simulated is not None:
+            metrics["command_loss"] = error(simulated)
         if penalty is not None:
             name, share, value = penalty
             metrics[name] = value()
             loss = loss + share * metrics[name]
         check_finite(metrics)
         self.model_optimizer.zero_grad()
-        (self.weights["consistency_loss"] * loss).backward()
+        scale, command = self.weights["consistency_loss"], self.model.dynamics.command
+        (scale * loss).backward(inputs=self.dynamics_parameters() if simulated else None)
+        if simulated is not None and command is not None:
+            (scale * metrics["command_loss"]).backward(inputs=list(command.parameters()))
         metrics["grad_norm"] = torch.nn.utils.clip_grad_norm_(self._model_parameters, self.grad_clip, foreach=True)
         self.model_optimizer.step()
         return metrics, encoded
@@ -379,10 +393,10 @@ class Agent:
     def _trains(self, name: str) -> bool:
         return any(name.startswith(part + ".") for part in self.trainable)
 
-    def _imagine(self, z: Tensor, actions: Tensor) -> Tensor:
-        zs = [z]
+    def _imagine(self, z: Tensor, actions: Tensor, dynamics: nn.Module | None = None) -> Tensor:
+        zs, step = [z], dynamics or self.model.dynamics
         for action in actions:
-            zs.append(self.model.next(zs[-1], action))
+            zs.append(by_blocks(step, zs[-1], action))
         return torch.stack(zs)
 
     def _decoder_loss(self, z: Tensor, observation: Tensor) -> Tensor:

@@ -96,6 +96,7 @@ class WorldModel(nn.Module):
         self.obs_dim, self.action_dim, self.memory_dim = obs_dim, action_dim, memory_dim
         self.latent_dim = latent_dim + memory_dim
         self.num_q, self.reward_from = num_q, reward_from
+        self.value_range = 1.0  # of the critics over what pretraining saw, 5 to 95 %, reward units
 
         code_dim, latent_dim = latent_dim, self.latent_dim
         pair = latent_dim + action_dim

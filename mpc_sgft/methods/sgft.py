@@ -1,5 +1,6 @@
 """Simulation-Guided Fine-Tuning: the simulated critic says what is worth reaching, real data teach how to get there."""
 
+import copy
 from collections.abc import Mapping
 from typing import Any
 
@@ -8,6 +9,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from mpc_sgft.learning.agent import Agent, floats
+from mpc_sgft.learning.dynamics import Dynamics
 from mpc_sgft.learning.method import AbstractMethod, Gate
 from mpc_sgft.learning.slices import to_slices
 
@@ -68,6 +70,7 @@ class SGFT(AbstractMethod):
         self.gate = Gate(gate_margin, gate_memory) if gate else None
         self.updates, self.slice_len, self.action_noise = updates, slice_len, action_noise
         self._pretrained: list[Tensor] = []  # of the dynamics, where the anchor holds them
+        self._simulated: Dynamics | None = None  # as they were pretrained, with the command map of those that train
 
     def take_over(self, agent: Agent) -> None:
         dynamics, parts = agent.model.dynamics, ("dynamics", "policy_head")
@@ -81,6 +84,9 @@ class SGFT(AbstractMethod):
             parts += ("dynamics.command",)
         agent.train_only(parts, lr=self.lr, policy_lr=self.policy_lr, command_lr=self.command_lr)
         self._pretrained = [p.detach().clone() for p in agent.dynamics_parameters()]
+        if self.command_map:
+            self._simulated = copy.deepcopy(dynamics).requires_grad_(False)
+            self._simulated.residual, self._simulated.command = None, dynamics.command
 
     def update(
         self, agent: Agent, batch: TensorDictBase, *, rollouts: int, weight: Tensor | None = None
@@ -91,12 +97,17 @@ class SGFT(AbstractMethod):
 
         data = to_slices(batch, agent.device)
         penalty = ("anchor_distance", self.anchor / rollouts, distance) if self.anchor else None
-        metrics, encoded = agent.fit_dynamics(data, rho=self.rho, weight=weight, penalty=penalty)
+        metrics, encoded = agent.fit_dynamics(
+            data, rho=self.rho, weight=weight, penalty=penalty, simulated=self._simulated
+        )
         return floats(metrics | agent.climb(encoded[0], horizon=self.horizon, entropy_coef=self.entropy_coef))
 
     def state_dict(self) -> dict[str, Any]:
-        return {"pretrained": [x.clone() for x in self._pretrained]}
+        simulated = self._simulated.base.state_dict() if self._simulated else None
+        return {"pretrained": [x.clone() for x in self._pretrained], "simulated": simulated}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         here = [x.device for x in self._pretrained]
         self._pretrained = [x.to(device) for x, device in zip(state["pretrained"], here, strict=True)]
+        if self._simulated:
+            self._simulated.base.load_state_dict(state["simulated"])

@@ -56,6 +56,7 @@ def pretrain(cfg: DictConfig) -> int:
 
     def save() -> None:
         """Weights and exact state, at the end of a round."""
+        agent.averaged.value_range = float(agent.scale.value)
         meta = checkpoint.describe(cfg, agent.averaged, extra={"transitions": state["transitions"]})
         checkpoint.save(folder / "checkpoint" / "model.safetensors", agent.averaged, meta)
         ahead = collector.result().state_dict() if state["transitions"] < cfg.transitions else None

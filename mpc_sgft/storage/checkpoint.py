@@ -23,6 +23,7 @@ from mpc_sgft.storage.whole_file import write_whole
 
 DIGEST_BYTES = 32  # SHA-256 in front of a saved state
 FORMAT = 1  # of the weights file; raise it when an old file can no longer be read
+EARLIER_RANGE = 20.0  # [reward] `value_range` where a header has none yet: those are of push
 WEIGHTS = Path("checkpoint") / "model.safetensors"  # inside a run folder
 
 
@@ -43,12 +44,14 @@ def describe(cfg: DictConfig, model: WorldModel, extra: Mapping[str, Any] | None
     assert isinstance(config, dict)
     for path in ("run_dir", "resume", "checkpoint"):  # where it was made is nobody else's business
         config.pop(path, None)
+        config["overrides"] = [x for x in config.get("overrides", []) if not x.startswith(f"{path}=")]
     return {
         "format": FORMAT,
         "task": str(cfg.chosen.task),
         "history": int(cfg.task.history),
         "discount": float(cfg.task.discount),
         "sizes": dict(model.sizes),
+        "value_range": float(model.value_range),
         "residual": model.dynamics.residual is not None,
         "command_map": model.dynamics.command is not None,
         "config": config,
@@ -117,6 +120,7 @@ def load(
         if meta.get("command_map"):
             model.add_command_map()
         model.load_state_dict(tensors)
+        model.value_range = float(meta.get("value_range", EARLIER_RANGE))
     except (TypeError, ValueError, RuntimeError) as err:
         raise CheckpointError(f"{file} does not fit the sizes in its own header ({err}). {_AGAIN}") from err
     return Loaded(model.to(device), meta)

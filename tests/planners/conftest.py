@@ -10,6 +10,8 @@ from torch import Tensor, nn
 class DoubleIntegrator:
     """x' = A x + B u, cost x'Qx + u'Ru, tail -x'Px of the discounted Riccati equation: best action -K x. float64."""
 
+    value_range = 1.0
+
     def __init__(self, discount: float, dt: float = 0.5) -> None:
         a, b = np.array([[1.0, dt], [0.0, 1.0]]), np.array([[0.5 * dt * dt], [dt]])
         q, r = np.diag([1.0, 0.1]), np.array([[0.3]])
@@ -49,7 +51,7 @@ class Random(nn.Module):
 
         self.dynamics, self.r = net(latent + action, latent), net(2 * latent + action, 1)
         self.v, self.pi = net(latent, 1), net(latent, action)
-        self.offset, self.scale = offset, scale
+        self.offset, self.scale, self.value_range = offset, scale, 1.0
 
     def next(self, z: Tensor, action: Tensor) -> Tensor:
         return self.dynamics(torch.cat([z, action], -1))

@@ -84,6 +84,19 @@ def test_minus_the_value_now_changes_no_plan(random_model, kind: type[MPPI] | ty
     assert_close(shaped, plain)
 
 
+@BOTH
+def test_the_size_of_rewards_changes_no_plan(random_model, kind: type[MPPI] | type[CEM]) -> None:
+    small, large = random_model().double(), random_model(scale=100.0).double()
+    value = large.terminal_value
+    large.terminal_value, large.value_range = lambda z: 100 * value(z), 100.0
+    z = torch.randn(5, 6, generator=seeded(1), dtype=torch.float64)
+    plans = [kind(**SMALL).plan(model, z, None, None, seeded()) for model in (small, large)]
+    assert_close(plans[1].mean, plans[0].mean)
+    assert_close(plans[1].value, 100 * plans[0].value)
+    large.value_range = 1.0
+    assert torch.allclose(kind(**SMALL).plan(large, z, None, None, seeded()).mean, plans[0].mean) == (kind is CEM)
+
+
 def test_cold_picks_the_best_and_hot_averages() -> None:
     pool, values = torch.rand(3, 64, 4, 2, generator=seeded()), torch.randn(3, 64, generator=seeded(1))
     best = pool[torch.arange(3), values.argmax(1)]

@@ -56,6 +56,10 @@ class ExactModel:
         now = torch.from_numpy(state(self.env))
         return torch.cat([now, torch.zeros(len(now), 1), observation.double()], -1)
 
+    @property
+    def value_range(self) -> float:
+        return self.model.value_range
+
     def next(self, z: Tensor, action: Tensor) -> Tensor:
         rows, commands = z.flatten(0, -2), action.flatten(0, -2)
         env, width = self.imagined(len(rows)), self.env.obs_dim

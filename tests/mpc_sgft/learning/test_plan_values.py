@@ -65,6 +65,7 @@ def test_a_plan_does_not_depend_on_the_way_to_its_values() -> None:
         next, reward, terminal_value, policy_prior = (
             model.next, model.reward, model.terminal_value, model.policy_prior
         )  # fmt: skip
+        value_range = 1.0
 
     planner = MPPI(action_dim=2, num_candidates=64, num_prior=8, num_elites=32, iterations=3, precision="float32")
     quick, plain = (planner.plan(m, z, None, None, torch.Generator().manual_seed(0)) for m in (model, Plain()))

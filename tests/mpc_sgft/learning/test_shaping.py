@@ -25,6 +25,8 @@ def test_a_terminal_state_has_no_potential_and_a_truncated_one_has():
 class Line:
     """State x on a line, x' = x + 0.1 a, V = x: the best action is 1 and the margin is known in closed form."""
 
+    value_range = 1.0
+
     def next(self, z, action):
         return z + 0.1 * action
 

@@ -20,6 +20,7 @@ def saved(path, residual=False):
     torch.manual_seed(0)
     model = WorldModel(**SIZES)
     model.normalizer.update(torch.randn(20, 6))
+    model.value_range = 2.5
     if residual:
         model.add_residual()
         torch.nn.init.normal_(model.dynamics.residual[-1].weight)
@@ -37,6 +38,22 @@ def test_a_model_comes_back_bit_for_bit_with_its_header(tmp_path, residual):
     assert torch.equal(model.next(model.encode(observation), action), loaded.next(loaded.encode(observation), action))
     assert (meta["task"], meta["history"], meta["discount"], meta["transitions"]) == ("push", 2, 0.99, 7)
     assert meta["config"]["train"]["lr"] == 3e-4
+    assert loaded.value_range == 2.5
+
+
+def test_a_header_does_not_say_where_it_was_made(tmp_path):
+    here = {"run_dir": "/home/me/run", "overrides": ["seed=3", "run_dir=/home/me/run"]}
+    model = saved(tmp_path / "model.safetensors")
+    config = checkpoint.describe(OmegaConf.merge(CFG, here), model)["config"]
+    assert config["overrides"] == ["seed=3"] and "/home/me" not in str(config)
+
+
+def test_a_header_of_before_has_the_range_of_push(tmp_path):
+    model = saved(tmp_path / "new.safetensors")
+    header = checkpoint.describe(CFG, model)
+    del header["value_range"]
+    checkpoint.save(tmp_path / "old.safetensors", model, header)
+    assert checkpoint.load(tmp_path / "old.safetensors").model.value_range == 20.0
 
 
 def test_a_run_folder_stands_for_the_file_inside(tmp_path):

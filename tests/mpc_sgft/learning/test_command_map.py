@@ -1,0 +1,47 @@
+"""The command map finds what the machine makes of commands, and leaves the dynamics what it cannot explain."""
+
+import copy
+
+import pytest
+import torch
+
+from mpc_sgft.learning.slices import Slices
+from tests.mpc_sgft.learning.agents import make_agent
+
+A, T, B = 2, 4, 64
+TRUTH = torch.tensor([[0.5, -0.3], [0.3, 0.5]])  # half of the command, turned
+
+
+def taught(agent, simulated: bool, updates: int = 300):
+    """Dynamics and map after updates on a machine that is the simulator but for its commands."""
+    dynamics = agent.model.dynamics
+    agent.model.add_command_map()
+    agent.train_only(("dynamics", "dynamics.command"), lr=3e-3, policy_lr=3e-3, command_lr=2e-2)
+    machine = copy.deepcopy(dynamics).requires_grad_(False)
+    machine.command.weight[:] = torch.cat([TRUTH, torch.zeros(A, 2 * A)], 1)
+    own = copy.deepcopy(dynamics).requires_grad_(False)
+    own.command = dynamics.command
+    agent.model.encode = lambda z: z  # latents in place of observations
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(updates):
+        action = 2 * torch.rand(T, B, A, generator=generator) - 1
+        z = [torch.cat([torch.rand(B, 16, generator=generator), 2 * torch.rand(B, 2 * A, generator=generator) - 1], 1)]
+        for a in action:
+            z.append(machine(z[-1], a))
+        data = Slices(torch.stack(z), action, torch.zeros(T, B), torch.zeros(T, B, dtype=torch.bool))
+        agent.fit_dynamics(data, rho=1.0, simulated=own if simulated else None)
+    return dynamics, own
+
+
+@pytest.mark.parametrize("simulated", [True, False])
+def test_a_turned_gain_is_found_and_the_dynamics_stay(simulated: bool) -> None:
+    agent = make_agent(sizes={"obs_dim": 6 + 2 * A, "memory_dim": 2 * A})
+    torch.nn.init.orthogonal_(agent.model.dynamics.base[-1].linear.weight)
+    dynamics, own = taught(agent, simulated)
+    off = (dynamics.command.weight[:, :A] - TRUTH).abs().max()
+    pairs = zip(dynamics.base.parameters(), own.base.parameters(), strict=True)
+    moved = sum(float((p.detach() - q).square().sum()) for p, q in pairs)
+    if simulated:
+        assert off < 0.03 and moved < 1.0
+    else:
+        assert off > 0.1, "both explain the data, and neither is the truth"
