@@ -16,9 +16,8 @@ def audit(model: WorldModel, steps: TensorDict, discount: float, *, seed: int) -
     device = next(model.parameters()).device
     with torch.inference_mode():
         z = model.encode(steps["next", "observation"].to(device))
-    reward = steps["next", "reward"][:, 0].to(device)
     generator = torch.Generator(device).manual_seed(seed)
-    return improvable(model, z, reward, action_dim=model.action_dim, discount=discount, generator=generator)
+    return improvable(model, z, action_dim=model.action_dim, discount=discount, generator=generator)
 
 
 def write_audit(path: Path, rollout: int, steps: TensorDict, margin: Tensor, names: tuple[str, ...]) -> None:

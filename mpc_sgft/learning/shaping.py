@@ -39,7 +39,6 @@ class Audit(NamedTuple):
 def improvable(
     model: Model,
     z: Tensor,
-    reward: Tensor,
     *,
     action_dim: int,
     discount: float,
@@ -50,36 +49,35 @@ def improvable(
 ) -> Audit:
     """Where the frozen value can be improved by one step of the learned dynamics (Definition 1 of the paper).
 
-        margin(s) = max_a gamma V(next(z, a)) - V(z) + r(s)     >= 0 is what the paper asks of every state
+        margin(s) = max_a r(z, a, z') + gamma V(z') - V(z),  z' = next(z, a)     >= 0 is asked of every state
 
-    The maximum is over samples: the policy's mean action, samples of the policy and of the whole action box, then
+    The paper writes r(s), which its V(s) begins with; here V(s) begins with the reward for arriving at z'. The maximum is over samples: the policy's mean action, samples of the policy and of the whole action box, then
     rounds of samples around the best one so far with half the spread of the round before. It is a lower bound, so a
     state called improvable is one (under the model).
 
     Args:
         model: Anything that satisfies `planners.base.Model`.
         z: Latents of states really visited, terminal ones left out, [M, D].
-        reward: The task's reward at those states, [M].
         action_dim: Entries of an action [A], in [-1, 1].
         discount: gamma, per control step.
         num_prior, num_uniform: Samples per state from the policy and from the box; a refinement has `num_uniform` too.
         refinements: Rounds around the best action.
 
     Raises:
-        ValueError: If z and reward do not agree in M or M is zero.
+        ValueError: If z is not [M, D], or M is zero.
     """
-    if z.ndim != 2 or reward.shape != z.shape[:1] or not len(z):
-        raise ValueError(
-            f"improvable wants z [M, D] and reward [M] with M > 0, got {tuple(z.shape)} and {tuple(reward.shape)}."
-        )
+    if z.ndim != 2 or not len(z):
+        raise ValueError(f"improvable wants z [M, D] with M > 0, got {tuple(z.shape)}.")
     states, device = len(z), z.device
 
     def normal(n: int) -> Tensor:
         return torch.randn(n, states, action_dim, generator=generator, device=device)
 
     def best_of(actions: Tensor) -> tuple[Tensor, Tensor]:  # [n, M, A]
-        value = model.terminal_value(model.next(z.expand(len(actions), -1, -1), actions))  # [n, M]
-        top, index = value.max(0)
+        start = z.expand(len(actions), -1, -1)
+        after = model.next(start, actions)
+        gain = model.reward(start, actions, after) + discount * model.terminal_value(after)  # [n, M]
+        top, index = gain.max(0)
         return top, actions[index, torch.arange(states, device=device)]
 
     prior = model.policy_prior(z.expand(num_prior, -1, -1), normal(num_prior)) if num_prior else normal(0)
@@ -90,5 +88,5 @@ def improvable(
         around = (action + spread * normal(num_uniform)).clamp(-1, 1)
         top, action = best_of(torch.cat([action.unsqueeze(0), around]))
         spread /= 2
-    margin = discount * top - model.terminal_value(z) + reward
+    margin = top - model.terminal_value(z)
     return Audit(margin, (margin >= 0).double().mean().item(), action)

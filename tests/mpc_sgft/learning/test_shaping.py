@@ -40,17 +40,16 @@ class Line:
         return torch.zeros_like(z) if noise is None else torch.tanh(0.1 * noise)
 
 
-def audit(x, reward, seed=0, **changes):
+def audit(x, seed=0, **changes):
     generator = torch.Generator().manual_seed(seed)
-    return improvable(Line(), x, reward, **(dict(action_dim=1, discount=0.9, generator=generator) | changes))
+    return improvable(Line(), x, **(dict(action_dim=1, discount=0.9, generator=generator) | changes))
 
 
 def test_margin_of_a_line_is_the_one_by_hand():
-    x = torch.tensor([[0.5], [1.0], [2.0]])
-    reward = torch.tensor([0.0, 0.0, 0.2])
-    found = audit(x, reward)
-    exact = 0.9 * (x.squeeze(1) + 0.1) - x.squeeze(1) + reward  # 0.04, -0.01, 0.09
-    assert_close(found.margin, exact, rtol=0, atol=2e-3)
+    x = torch.tensor([[-0.1], [-0.3], [0.5]])
+    found = audit(x)
+    exact = 1.9 * (x.squeeze(1) + 0.1) - x.squeeze(1)  # 0.1, -0.08, 0.64: arriving pays, too
+    assert_close(found.margin, exact, rtol=0, atol=4e-3)
     assert found.share == pytest.approx(2 / 3)
     assert_close(found.action, torch.ones(3, 1), rtol=0, atol=0.02)
     assert (found.margin <= exact + 1e-6).all()  # a lower bound: never claims what is not there
@@ -59,19 +58,21 @@ def test_margin_of_a_line_is_the_one_by_hand():
 class Peak(Line):
     """V = 1 - (x - 0.0337)^2 from x = 0: the best action is 0.337, inside the box, so refining pays."""
 
+    def reward(self, z, action, next_z):
+        return torch.zeros_like(next_z).squeeze(-1)
+
     def terminal_value(self, z):
         return 1 - (z.squeeze(-1) - 0.0337) ** 2
 
 
 def test_refinement_finds_an_inner_optimum():
-    model, x, reward = Peak(), torch.zeros(20, 1), torch.zeros(20)
+    model, x = Peak(), torch.zeros(20, 1)
 
     def miss(refinements):
         generator = torch.Generator().manual_seed(1)
         found = improvable(
             model,
             x,
-            reward,
             action_dim=1,
             discount=1.0,
             generator=generator,
@@ -86,10 +87,10 @@ def test_refinement_finds_an_inner_optimum():
 
 
 def test_the_same_generator_gives_the_same_audit():
-    x, reward = torch.rand(9, 1), torch.zeros(9)
-    assert torch.equal(audit(x, reward, seed=3).margin, audit(x, reward, seed=3).margin)
+    x = torch.rand(9, 1)
+    assert torch.equal(audit(x, seed=3).margin, audit(x, seed=3).margin)
 
 
 def test_shapes_that_do_not_agree_are_refused():
     with pytest.raises(ValueError, match=r"\[M, D\]"):
-        audit(torch.zeros(3, 1), torch.zeros(2))
+        audit(torch.zeros(3))
