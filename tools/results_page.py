@@ -14,6 +14,7 @@ from statistics import median
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "results"
+TASKS = ("hammer", "insert", "push_towel", "push_ball")
 BEGIN, END = "<!-- headline:begin -->", "<!-- headline:end -->"
 Row = dict[str, str]
 
@@ -89,6 +90,19 @@ def transfer() -> str:
     return curves(rows, lambda r: f"`{r['gap']}`, {r['method']}", "gap and method")
 
 
+def tasks() -> str:
+    head: dict[str, str | tuple[str, Callable[[str], str]]] = {
+        "task": "task",
+        "transitions": "transitions",
+        "minutes": "minutes",
+        "planner's success": ("success", percent),
+        "episodes": "episodes",
+    }
+    rows = [row for name in TASKS for row in read(f"tasks/{name}.csv")]
+    simulated = pick(read("tasks/pretrained.csv"), head)
+    return f"{simulated}\n\n" + curves(rows, lambda r: f"`{r['gap']}`, {r['method']}", "gap and method")
+
+
 def left_out(row: Row) -> str:
     """The gap of a row and what its variant leaves out."""
     changes = [change.split("=")[0].split(".")[-1] for change in row["variant"].split()]
@@ -127,7 +141,7 @@ def scored(row: Row) -> str:
 def judgement() -> str:
     rows = read("judgement/judgement.csv")
     lines = []
-    for name in dict.fromkeys(r["without"] for r in rows):
+    for name in dict.fromkeys(r["without"] for r in rows if "+" not in r["without"]):  # those are of fewer cases
         mine = [r for r in rows if r["without"] == name]
         right = sum(float(r[f"{g}_exact"] or 0) * int(r[f"{g}_exact_of"]) for r in mine for g in ("single", "pair"))
         wrong = sum(float(r[g] or 0) * int(r[f"{g}_of"]) for r in mine for g in ("false_alarms", "wrong_outside"))
@@ -241,6 +255,7 @@ def exact() -> str:
 STUDIES: dict[str, Callable[[], str]] = {
     "pretrain": pretrain,
     "transfer": transfer,
+    "tasks": tasks,
     "ablation": lambda: curves(read("ablation/ablation.csv"), left_out, "gap, and what is left out"),
     "horizon": lambda: curves(read("horizon/horizon.csv"), lambda r: r["variant"], "variant"),
     "pendulum": lambda: curves(read("pendulum/pendulum.csv"), lambda r: r["method"], "method"),
@@ -288,6 +303,13 @@ def headline() -> str:
         ]
         text = " → ".join(spread(values).replace(" %", "") for values in after) + " %"
         rows.append([f"`{gap}`, 0 → 10 → 30 rollouts", text, "transfer"])
+    for task in TASKS:
+        runs = read(f"tasks/{task}.csv")
+        counts = sorted({int(r["rollouts"]) for r in runs})
+        shown = [counts[0], counts[len(counts) // 2], counts[-1]]
+        after = [[float(r["success"]) for r in runs if int(r["rollouts"]) == n] for n in shown]
+        text = " → ".join(spread(values).replace(" %", "") for values in after) + " %"
+        rows.append([f"`{task}_real`, {' → '.join(map(str, shown))}", text, "tasks"])
     score = {r["score"]: r for r in read("blind/blind.csv") if r["method"] == "diagnose"}
     top, false = score["single, clear: top 1"], score["no effect: false alarms"]
     rows.append(["diagnose, right name", f"{percent(top['value'])} of {top['of']}", "blind"])

@@ -177,7 +177,12 @@ class Hammer(AbstractTask):
 
     def view(self) -> View:
         return View(
-            eye=(0.95, -1.1, 0.95), target=(0.2, 0.0, 0.62), object_radius=self.nail_head[0], object_height=0.005
+            eye=(0.95, -1.0, 0.9),
+            target=(0.22, 0.0, 0.58),
+            second_eye=(0.35, -0.7, 0.65),
+            second_target=(0.35, 0.0, 0.65),
+            object_radius=self.nail_head[0],
+            object_height=0.005,
         )
 
     def value_plane(self, points: int) -> ValuePlane:

@@ -171,7 +171,14 @@ class Insert(AbstractTask):
         return np.concatenate([qpos[:, 7:9], np.full((len(qpos), 1), TOP)], 1)
 
     def view(self) -> View:
-        return View(eye=(1.2, -0.8, 0.6), target=(0.4, 0.0, 0.22), object_radius=self.leg_radius, object_height=0.01)
+        return View(
+            eye=(1.2, -0.8, 0.6),
+            target=(0.4, 0.0, 0.22),
+            second_eye=(0.5, -0.5, 0.2),
+            second_target=(0.5, 0.0, 0.15),
+            object_radius=self.leg_radius,
+            object_height=0.01,
+        )
 
     def value_plane(self, points: int) -> ValuePlane:
         """V over x and height of the leg's end, in the plane through a hole in the middle of its range."""

@@ -2,6 +2,7 @@
 
 import pytest
 
+from mpc_sgft.api import measure
 from mpc_sgft.command import compose
 from mpc_sgft.command.errors import UserError
 from mpc_sgft.runs import build
@@ -13,8 +14,10 @@ def test_a_variant_of_a_task_takes_its_agents_and_another_task_does_not() -> Non
     assert compose.compose("pretrain", ["task=push_edge"], []).randomize.draws
     _, meta = build.load_agent(cfg)
     assert meta["task"] == "push"
-    with pytest.raises(UserError, match=r"no checkpoint is shipped for task 'hammer' \(shipped: push\)"):
-        build.load_agent(compose.compose("evaluate", ["task=hammer"], []))
+    with pytest.raises(
+        UserError, match=r"no checkpoint is shipped for task 'pendulum' \(shipped: hammer, insert, push\)"
+    ):
+        build.load_agent(compose.compose("evaluate", ["task=pendulum"], []))
     for soft in ("push_towel", "push_ball"):
         assert (
             build.load_agent(compose.compose("deploy", [f"task={soft}", f"gap={soft}_real"], []))[1]["task"] == "push"
@@ -22,3 +25,11 @@ def test_a_variant_of_a_task_takes_its_agents_and_another_task_does_not() -> Non
     cfg.checkpoint, cfg.task.agents_of = str(build.shipped("push")), "pendulum"
     with pytest.raises(UserError, match="expected task='push_edge', found task='push'"):
         build.load_agent(cfg)
+
+
+@pytest.mark.parametrize("task", ["hammer", "insert"])
+def test_a_shipped_agent_does_its_task_and_knows_the_range_of_its_values(task: str) -> None:
+    cfg = compose.compose("evaluate", [f"task={task}"], [])
+    agent, meta = build.load_agent(cfg)
+    assert agent.model.value_range == meta["value_range"] > 1
+    assert measure(cfg, agent, episodes=8).success >= 0.85
