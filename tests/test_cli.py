@@ -310,6 +310,7 @@ def test_wrong_values_found_while_building_are_the_users() -> None:
         (lambda cfg: cfg.pop("collector"), "it had no collector"),
         (lambda cfg: cfg.pop("physics"), "it had no physics"),
         (lambda cfg: cfg.train.agent.pop("td_lambda"), "it had no train.agent.td_lambda"),
+        (lambda cfg: cfg.planner.update(temperature=2.0), "its planner.temperature was in reward units"),
         (
             lambda cfg: cfg.collector.update({"_target_": "mpc_sgft.gone.Process"}),
             "gone.Process has moved since",

@@ -204,6 +204,8 @@ def resume(name: str, folder: str, overrides: Sequence[str], given: Sequence[str
     taken_out = tuple(text[1:].partition("=")[0] for text in cfg.overrides if text.startswith("~"))
     lacking = (key for key in _lacking(_of_today(name, cfg), cfg) if not key.startswith(taken_out))
     differs += [f"it had no {key}" for key in lacking]
+    if OmegaConf.select(cfg, "planner.temperature", default=0) > 1:
+        differs += ["its planner.temperature was in reward units"]
     if differs:
         raise UserError(
             f"cannot resume {folder}: an earlier version wrote it ({differs[0]}). "
