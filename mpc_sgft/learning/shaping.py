@@ -51,9 +51,10 @@ def improvable(
 
         margin(s) = max_a r(z, a, z') + gamma V(z') - V(z),  z' = next(z, a)     >= 0 is asked of every state
 
-    The paper writes r(s), which its V(s) begins with; here V(s) begins with the reward for arriving at z'. The maximum is over samples: the policy's mean action, samples of the policy and of the whole action box, then
-    rounds of samples around the best one so far with half the spread of the round before. It is a lower bound, so a
-    state called improvable is one (under the model).
+    The paper writes r(s), with which its V(s) begins; here V(s) begins with the reward for arriving at z'. The maximum
+    is over samples: the policy's mean action, samples of the policy and of the whole action box, then rounds of samples
+    around the best one so far with half the spread of the round before. It is a lower bound, so a state called
+    improvable is one (under the model).
 
     Args:
         model: Anything that satisfies `planners.base.Model`.
