@@ -65,7 +65,7 @@ class PushTowel(PushSoft):
     """
 
     name = "push_towel"
-    height = THICK = 0.012  # [m] half the thickness
+    height = 0.012  # [m] half the thickness
 
     def _add_flex(self, body: mujoco.MjsBody) -> mujoco.MjsFlex:
         spacing, thin = 0.015, 0.004  # a sheet thicker than its spacing is refused here, and works
@@ -79,7 +79,7 @@ class PushTowel(PushSoft):
             mass=self.puck_mass,
             equality=1,
         )
-        flex.radius = self.THICK
+        flex.radius = self.height
         return flex
 
     def view(self) -> View:

@@ -23,7 +23,7 @@ from mpc_sgft.storage.whole_file import write_whole
 
 DIGEST_BYTES = 32  # SHA-256 in front of a saved state
 FORMAT = 1  # of the weights file; raise it when an old file can no longer be read
-EARLIER_RANGE = 20.0  # [reward] `value_range` where a header has none yet: those are of push
+EARLIER_RANGE = 20.0  # [reward] where a header has none: a temperature of 0.1 is then the 2.0 reward units of before
 WEIGHTS = Path("checkpoint") / "model.safetensors"  # inside a run folder
 
 

@@ -19,7 +19,8 @@ from mpc_sgft.runs.deploy import make_transfer
 SIZES = {"obs_dim": 6, "action_dim": 1, "decode_dim": 2, "memory_dim": 2, "latent_dim": 16, "mlp_dim": 32}
 SIZES |= {"enc_dim": 32, "num_q": 2}
 METHODS = choices.groups()["method"]
-# Written by the version in which Agent held every method, with the numbers below (commit 6d50529).
+# Written by the version in which Agent held every method (commit 6d50529), with the numbers below; those of sgft with a
+# command map by the version in which the map learns first.
 AS_BEFORE = json.loads((Path(__file__).parent / "as_before.json").read_text())
 
 

@@ -122,7 +122,7 @@ def test_a_rival_that_is_worse_with_the_traces_in_it_does_not_tie() -> None:
         return h._replace(errors=error + 0.01 * np.random.default_rng(len(names)).normal(size=24))
 
     best, rival, there, worse = judged("a", 1.3), judged("b", 1.25), judged("ac", 0.9), judged("bc", 1.1)
-    alike = worse._replace(errors=there.errors, fit=there.fit._replace(terms=worse.fit.terms), fitted=there.fitted)
+    alike = worse._replace(errors=there.errors, fitted=there.fitted)
     assert find_ties(setup, best, best, [best, rival, there, worse], rng) == [rival]
     assert find_ties(setup, best, there, [best, rival, there], rng) == [rival], "nobody has looked"
     assert find_ties(setup, best, there, [best, rival, there, worse], rng) == []
