@@ -20,17 +20,21 @@ from envs.env import ControlEnv
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 
 
+def read(group: str, name: str) -> dict[str, Any]:
+    """The numbers of configs/<group>/<name>.yaml and of the files that its defaults list names."""
+    own = yaml.safe_load((CONFIGS / group / f"{name}.yaml").read_text())
+    told: dict[str, Any] = {}
+    for each in (*(read(group, parent) for parent in own.pop("defaults", []) if parent != "_self_"), own):
+        told |= {key: told[key] | new if isinstance(new, dict) and key in told else new for key, new in each.items()}
+    return told
+
+
 @pytest.fixture
 def make_task() -> Callable[..., Any]:
     """make_task(name, **changes): a task with the numbers of configs/task/<name>.yaml."""
 
     def make(name: str, **changes: Any) -> Any:
-        own = yaml.safe_load((CONFIGS / f"task/{name}.yaml").read_text())
-        parents = [p for p in own.get("defaults", []) if p != "_self_"]
-        numbers = {}
-        for said in (*(yaml.safe_load((CONFIGS / f"task/{p}.yaml").read_text()) for p in parents), own):
-            numbers |= said["env"]
-        numbers |= changes
+        numbers = read("task", name)["env"] | changes
         module, kind = numbers.pop("_target_").rsplit(".", 1)
         return getattr(importlib.import_module(module), kind)(**numbers)
 
@@ -74,7 +78,7 @@ def make_backend(make_task) -> Callable[..., SimBackend]:
 
     def make(task, num_envs=1, *, effects_=None, draws=None, randomised=False, changes=None, **kwargs: Any):
         if randomised:
-            table = yaml.safe_load((CONFIGS / f"randomize/{task}.yaml").read_text())
+            table = read("randomize", task)
             draws = table["draws"]
             kwargs = {"noise_sd": table["noise_sd"], "noise_probability": table["noise_probability"], **kwargs}
         return SimBackend(
