@@ -5,6 +5,7 @@ in the CSV is not measured again.
 """
 
 import csv
+import itertools
 import json
 import os
 import subprocess
@@ -49,6 +50,14 @@ def finished(command: str, folder: Path, overrides: Sequence[str], launcher: str
         if done.returncode:
             raise RunFailed(f"{folder}: exit code {done.returncode}\n{done.stderr[-2000:]}")
     return json.loads(summary.read_text())
+
+
+def first_mean(folder: Path, column: str, rows: int) -> float | None:
+    """Mean of a column over the first rows of a run's metrics.csv; None where they hold no number."""
+    with (folder / "metrics.csv").open(newline="") as file:
+        found = [row.get(column) for row in itertools.islice(csv.DictReader(file), rows)]
+    numbers = [float(text) for text in found if text]
+    return sum(numbers) / len(numbers) if numbers else None
 
 
 def each(jobs: Sequence[Job], work: Callable[[Job], dict[str, Any]], side_by_side: int) -> tuple[list[dict], int]:

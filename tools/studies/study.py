@@ -13,9 +13,10 @@ import itertools
 import sys
 from pathlib import Path
 
-from tools.studies.runner import each, finished, write
+from tools.studies.runner import each, finished, first_mean, write
 
-COLUMNS = ["gap", "method", "variant", "seed", "rollouts", "success", "episodes", "frozen_sha256"]
+COLUMNS = ["gap", "method", "variant", "seed", "rollouts", "success", "episodes", "audit", "frozen_sha256"]
+AUDITED = 5  # rollouts, the first, whose mean improvability share stands in each row as `audit`
 
 
 def main() -> None:
@@ -53,7 +54,8 @@ def main() -> None:
         result = finished("deploy", args.runs / label, [*words, *args.set], args.launcher)
         curve = ", ".join(f"{k}: {v:.0%}" for k, v in result["curve"].items())
         print(f"{label}: {curve} ({result['wall_seconds']:.0f} s)", flush=True)
-        return result | {"variant": variant}
+        audit = first_mean(args.runs / label, "audit_share", AUDITED)
+        return result | {"variant": variant, "audit": None if audit is None else round(audit, 4)}
 
     results, failed = each(jobs, work, args.jobs)
     rows = [

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from tools.studies.runner import RunFailed, each, finished, measured
+from tools.studies.runner import RunFailed, each, finished, first_mean, measured
 
 TINY = ["+experiment=debug", "task=pendulum", "transitions=640", "log.tensorboard=false"]
 
@@ -67,3 +67,9 @@ def test_rows_are_on_disk_as_they_come_and_not_measured_twice(tmp_path):
     with pytest.raises(ValueError, match="other"):
         measured(path, ["gap", "other"], keys, work)
     assert Path(path).read_text().startswith("gap,horizon,success")
+
+
+def test_the_mean_of_a_columns_first_rows(tmp_path):
+    (tmp_path / "metrics.csv").write_text("step,share,other\n1,0.5,\n2,,\n3,0.25,\n4,0.9,\n")
+    assert first_mean(tmp_path, "share", 3) == pytest.approx(0.375)  # the gap is left out
+    assert first_mean(tmp_path, "other", 3) is None and first_mean(tmp_path, "absent", 3) is None
