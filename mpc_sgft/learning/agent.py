@@ -1,19 +1,18 @@
-"""World model + optimisers: update() is the TD-MPC2 objective, fit_dynamics() and climb() are what methods add."""
+"""World model + optimisers: update() is the TD-MPC2 objective; what methods of deployment add is in fit.py."""
 
 import copy
 import hashlib
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from torch import Tensor, nn
+from torch import Tensor
 
 from mpc_sgft.learning import losses
 from mpc_sgft.learning.averaged import AveragedWeights
-from mpc_sgft.learning.layers import by_blocks
 from mpc_sgft.learning.precision import dtype_of_products, in_own_precision
-from mpc_sgft.learning.slices import FiniteWatch, Slices, arranged, check_finite, floats, to_slices
+from mpc_sgft.learning.slices import FiniteWatch, arranged, floats
 from mpc_sgft.learning.world_model import WorldModel
 
 PRETRAINED = ("encoder", "dynamics", "reward_head", "q_ensemble", "value_head", "policy_head", "decoder")
@@ -90,7 +89,7 @@ class Agent:
         self._averaged = AveragedWeights(self.model, average_decay)
         self.pretraining, self.imagined_steps = True, 0
         self.trainable: tuple[str, ...] = (*PRETRAINED, *FOLLOWING)
-        self._make_optimizers(lr, lr, lr)
+        self._make_optimizers(lr, lr)
 
     @property
     def averaged(self) -> WorldModel:
@@ -134,7 +133,7 @@ class Agent:
         heads = None if model.num_q == 2 else self._two_heads()
         target = losses.targets(model, encoded, data, noise, heads, self.discount, self.td_lambda)
 
-        zs = self._imagine(first_z, data.action)  # [T + 1, B, D]
+        zs = losses.imagine(model.dynamics, first_z, data.action)  # [T + 1, B, D]
         q_logits = model.q_logits(zs[:-1], data.action)  # [E, T, B, bins]
         per_step = {
             "consistency_loss": losses.consistency_loss(zs[1:], encoded[1:]),
@@ -150,7 +149,7 @@ class Agent:
         metrics["loss"] = total
         self.model_optimizer.zero_grad()
         total.backward()
-        metrics["grad_norm"] = torch.nn.utils.clip_grad_norm_(self._model_parameters, self.grad_clip, foreach=True)
+        metrics["grad_norm"] = torch.nn.utils.clip_grad_norm_(self.model_parameters, self.grad_clip, foreach=True)
         self.model_optimizer.step()
 
         if policy_too:
@@ -220,6 +219,7 @@ class Agent:
         lr: float,
         policy_lr: float,
         command_lr: float | None = None,
+        observation_lr: float | None = None,
         following: tuple[str, ...] = (),
     ) -> None:
         """End pretraining: freeze everything but some parts, and start fresh optimisers and TD-MPC2's own targets.
@@ -229,6 +229,7 @@ class Agent:
             lr: Of Adam for these; the encoder takes its share of it.
             policy_lr: Of Adam for the policy prior.
             command_lr: Of Adam for the command map of the dynamics; None: lr.
+            observation_lr: Of Adam for the observation map; None: lr.
             following: Parts that updates change without a gradient.
         """
         self.pretraining, self.trainable = False, (*parts, *following)
@@ -237,7 +238,7 @@ class Agent:
         for part in parts:
             self.model.get_submodule(part).requires_grad_(True)
         if parts:
-            self._make_optimizers(lr, policy_lr, lr if command_lr is None else command_lr)
+            self._make_optimizers(lr, policy_lr, command_lr, observation_lr)
 
     def dynamics_parameters(self) -> list[Tensor]:
         """What trains of the dynamics, the command map left out."""
@@ -246,69 +247,9 @@ class Agent:
         return [p for module in modules if module for p in module.parameters() if p.requires_grad]
 
     @in_own_precision
-    def fit_dynamics(
-        self,
-        data: Slices,
-        *,
-        rho: float,
-        weight: Tensor | None = None,
-        penalty: tuple[str, float, Callable[[], Tensor]] | None = None,
-        simulated: nn.Module | None = None,
-    ) -> tuple[dict[str, Tensor], Tensor]:
-        """One step of the dynamics toward the encoded observations; encoder and observations stay as they are.
-
-        Args:
-            data: Slices of T steps.
-            rho: Weight of imagined step t is rho^t.
-            weight: Of each slice, [B], mean one; None weighs all alike.
-            penalty: Name, weight and value of what is added to the loss, worked out after it.
-            simulated: The simulator's dynamics with the same command map. If given, the map learns what it can explain
-                of the data together with these, and the dynamics learn the rest with the map as it is. Learned at
-                once, a growing map and shrinking dynamics explain the same data, and neither holds elsewhere.
-
-        Returns:
-            Metrics, and the encoded observations, [T + 1, B, D].
-
-        Raises:
-            FloatingPointError: If a loss is not finite; nothing has changed then.
-        """
-        with torch.no_grad():
-            encoded = self.model.encode(data.observation)  # [T + 1, B, D]
-
-        def error(dynamics: nn.Module) -> Tensor:
-            zs = self._imagine(encoded[0], data.action, dynamics)
-            return losses.over_time(losses.consistency_loss(zs[1:], encoded[1:]), rho, weight)
-
-        loss = error(self.model.dynamics)
-        metrics = {"consistency_loss": loss}
-        if simulated is not None:
-            metrics["command_loss"] = error(simulated)
-        if penalty is not None:
-            name, share, value = penalty
-            metrics[name] = value()
-            loss = loss + share * metrics[name]
-        check_finite(metrics)
-        self.model_optimizer.zero_grad()
-        scale, command = self.weights["consistency_loss"], self.model.dynamics.command
-        (scale * loss).backward(inputs=self.dynamics_parameters() if simulated else None)
-        if simulated is not None and command is not None:
-            (scale * metrics["command_loss"]).backward(inputs=list(command.parameters()))
-        metrics["grad_norm"] = torch.nn.utils.clip_grad_norm_(self._model_parameters, self.grad_clip, foreach=True)
-        self.model_optimizer.step()
-        return metrics, encoded
-
-    @in_own_precision
     def climb(self, starts: Tensor, *, horizon: int, entropy_coef: float) -> dict[str, Tensor]:
         """A step of the policy prior up the SGFT objective of `horizon` imagined steps from latents [B, D]."""
         return self._climb(starts, horizon, entropy_coef, read=True)[0]
-
-    @torch.no_grad()
-    def model_error(self, batch: TensorDictBase) -> Tensor:
-        """Squared latent error of the dynamics after 1..T open-loop steps, mean over the latent, [B, T]."""
-        data = to_slices(batch, self.device)
-        encoded = self.model.encode(data.observation)
-        zs = self._imagine(encoded[0], data.action)
-        return losses.consistency_loss(zs[1:], encoded[1:]).transpose(0, 1)
 
     # -- state ---------------------------------------------------------------------------------------------------------
 
@@ -372,17 +313,20 @@ class Agent:
 
     # -- helpers -------------------------------------------------------------------------------------------------------
 
-    def _make_optimizers(self, lr: float, policy_lr: float, command_lr: float) -> None:
+    def _make_optimizers(
+        self, lr: float, policy_lr: float, command_lr: float | None = None, observation_lr: float | None = None
+    ) -> None:
         model = self.model
-        command = [] if model.dynamics.command is None else [*model.dynamics.command.parameters()]
-        groups = [{"params": command, "lr": command_lr}] if command else []
+        maps = ((model.dynamics.command, command_lr), (model.observation_map, observation_lr))
+        groups = [{"params": [*part.parameters()], "lr": lr if own is None else own} for part, own in maps if part]
+        command = groups[0]["params"] if model.dynamics.command is not None else []
         for part in PRETRAINED:
             parameters = [p for p in getattr(model, part).parameters() if p.requires_grad and part != "policy_head"]
             parameters = [p for p in parameters if all(p is not c for c in command)]
             if parameters:
                 share = self.encoder_lr_share if part == "encoder" else 1.0
                 groups.append({"params": parameters, "lr": lr * share})
-        self._model_parameters = [p for group in groups for p in group["params"]]
+        self.model_parameters = [p for group in groups for p in group["params"]]
         self.model_optimizer = torch.optim.Adam(groups, fused=True)
         self.policy_optimizer = torch.optim.Adam(model.policy_head.parameters(), lr=policy_lr, eps=1e-5, fused=True)
         self.entropy_optimizer = torch.optim.Adam([self.log_entropy_coef], lr=self.entropy_lr, fused=True)
@@ -392,12 +336,6 @@ class Agent:
 
     def _trains(self, name: str) -> bool:
         return any(name.startswith(part + ".") for part in self.trainable)
-
-    def _imagine(self, z: Tensor, actions: Tensor, dynamics: nn.Module | None = None) -> Tensor:
-        zs, step = [z], dynamics or self.model.dynamics
-        for action in actions:
-            zs.append(by_blocks(step, zs[-1], action))
-        return torch.stack(zs)
 
     def _decoder_loss(self, z: Tensor, observation: Tensor) -> Tensor:
         wanted = self.model.normalizer(observation)[..., : self.model.sizes["decode_dim"]]

@@ -12,8 +12,9 @@ from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
-from torch import Tensor
+from torch import Tensor, nn
 
+from mpc_sgft.learning.layers import by_blocks
 from mpc_sgft.learning.slices import Slices
 from mpc_sgft.learning.world_model import WorldModel
 
@@ -29,6 +30,14 @@ def over_time(loss: Tensor, rho: float, weight: Tensor | None = None) -> Tensor:
     steps = torch.arange(loss.shape[0], dtype=loss.dtype, device=loss.device)
     mean = (loss if weight is None else loss * weight).mean(1)  # [T]
     return (rho**steps * mean).mean()
+
+
+def imagine(dynamics: nn.Module, z: Tensor, actions: Tensor) -> Tensor:
+    """Latents from z [B, D] on, by actions [T, B, A]: [T + 1, B, D]."""
+    zs = [z]
+    for action in actions:
+        zs.append(by_blocks(dynamics, zs[-1], action))
+    return torch.stack(zs)
 
 
 def consistency_loss(imagined: Tensor, encoded: Tensor) -> Tensor:

@@ -8,6 +8,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from mpc_sgft.learning.agent import Agent
+from mpc_sgft.learning.observation_map import Sensed
 
 
 class Gate(NamedTuple):
@@ -42,17 +43,22 @@ class AbstractMethod(ABC):
     gate: Gate | None = None
 
     @abstractmethod
-    def take_over(self, agent: Agent) -> None:
-        """Freeze a pretrained agent but for what this method trains; called once, before the first rollout."""
+    def take_over(self, agent: Agent, sensed: Sensed) -> None:
+        """Freeze a pretrained agent but for what this method trains; called once, before the first rollout.
+
+        Args:
+            agent: Pretrained.
+            sensed: What the task observes, and where its simulated episodes start.
+        """
 
     @abstractmethod
-    def update(self, agent: Agent, batch: TensorDictBase, *, rollouts: int, weight: Tensor | None = None) -> dict:
+    def update(self, agent: Agent, batch: TensorDictBase, *, starts: Tensor, weight: Tensor | None = None) -> dict:
         """One step on slices [B, T] of real data; returns metrics, {name: float}.
 
         Args:
             agent: That this method took over.
             batch: As from the buffer.
-            rollouts: How many there have been.
+            starts: The first observation of each rollout so far, [R, O].
             weight: Of each slice, [B], mean one; None weighs all alike.
 
         Raises:

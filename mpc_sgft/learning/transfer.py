@@ -19,6 +19,7 @@ from tensordict import TensorDict
 from mpc_sgft.learning.agent import Agent
 from mpc_sgft.learning.buffer import make_buffer
 from mpc_sgft.learning.method import AbstractMethod
+from mpc_sgft.learning.observation_map import Sensed
 from mpc_sgft.learning.world_model import WorldModel
 
 
@@ -38,17 +39,21 @@ class Transfer:
         method: What trains, and how.
         capacity: Real transitions to hold.
         batch_size, seed: Of the replay slices.
+        sensed: As in `AbstractMethod.take_over`.
     """
 
-    def __init__(self, agent: Agent, method: AbstractMethod, *, capacity: int, batch_size: int, seed: int):
+    def __init__(
+        self, agent: Agent, method: AbstractMethod, sensed: Sensed, *, capacity: int, batch_size: int, seed: int
+    ):
         self.agent, self.method, self.slice_len = agent, method, method.slice_len
-        method.take_over(agent)
+        method.take_over(agent, sensed)
         sizes = {"capacity": capacity, "slice_len": method.slice_len, "batch_size": batch_size}
         self._new_buffer = partial(make_buffer, **sizes, seed=seed, device=agent.device)
         self.buffer = self._new_buffer()
         self.pretrained = copy.deepcopy(agent.model)
         self.acting: WorldModel = copy.deepcopy(agent.model)
         self.verdicts: list[Verdict] = []
+        self.starts: list[torch.Tensor] = []  # first observation of each rollout
 
     def judge(self, steps: TensorDict) -> Verdict:
         """Test both dynamics on a rollout [T] before it is learned from, and decide who acts next."""
@@ -72,9 +77,10 @@ class Transfer:
         """
         verdict = self.judge(steps)
         self.buffer.extend(steps)
-        metrics: dict[str, float] = {}
+        self.starts.append(steps["observation"][0].to(self.agent.device))
+        starts, metrics = torch.stack(self.starts), dict[str, float]()
         for _ in track(range(self.method.updates)):
-            metrics = self.method.update(self.agent, self.buffer.sample(), rollouts=len(self.verdicts))
+            metrics = self.method.update(self.agent, self.buffer.sample(), starts=starts)
         self.acting.load_state_dict((self.agent.model if verdict.accepted else self.pretrained).state_dict())
         return metrics | {"error_pretrained": verdict.pretrained, "error_fine_tuned": verdict.fine_tuned}
 
@@ -84,6 +90,7 @@ class Transfer:
             "method": self.method.state_dict(),
             "buffer": self.buffer.state_dict(),
             "acting": self.acting.state_dict(),
+            "starts": [x.clone() for x in self.starts],
             "verdicts": [tuple(v) for v in self.verdicts],
         }
 
@@ -93,6 +100,7 @@ class Transfer:
         self.buffer = self._new_buffer()  # what is loaded may hold less than what is there
         self.buffer.load_state_dict(state["buffer"])
         self.acting.load_state_dict(state["acting"])
+        self.starts = [x.to(self.agent.device) for x in state["starts"]]
         self.verdicts = [Verdict(*v) for v in state["verdicts"]]
 
 

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 
 from mpc_sgft.learning.dynamics import Dynamics
 from mpc_sgft.learning.layers import Ensemble, Normalizer, SimNorm, TwoHot, by_blocks, gaussian_tanh, mlp
+from mpc_sgft.learning.observation_map import ObservationMap
 from mpc_sgft.learning.plan_values import PlanValues, PlanWeights
 from mpc_sgft.learning.precision import dtype_of_products
 
@@ -103,6 +104,7 @@ class WorldModel(nn.Module):
         self.two_hot = TwoHot(num_bins, vmin, vmax)
         self.normalizer = Normalizer(obs_dim)
         self.encoder = mlp([obs_dim - memory_dim, *[enc_dim] * enc_layers, code_dim], out=SimNorm(simnorm_dim))
+        self.observation_map: ObservationMap | None = None
         self.dynamics = Dynamics(code_dim, memory_dim, action_dim, mlp_dim, simnorm_dim)
         self.reward_head = mlp([pair, mlp_dim, mlp_dim, num_bins], zero_out=True)
         self.q_ensemble = Ensemble(
@@ -145,6 +147,8 @@ class WorldModel(nn.Module):
     def encode(self, observation: Tensor) -> Tensor:
         """Latent of a raw observation, [..., O] -> [..., D]."""
         seen = self.obs_dim - self.memory_dim
+        if self.observation_map is not None:
+            observation = self.observation_map(observation)
         code = by_blocks(lambda o: self.encoder(self.normalizer(o)[..., :seen]), observation)
         return torch.cat([code, observation[..., seen:]], -1) if self.memory_dim else code
 
@@ -202,6 +206,23 @@ class WorldModel(nn.Module):
         command.weight.copy_(torch.eye(self.action_dim, self.action_dim + self.memory_dim))
         command.bias.zero_()
         self.dynamics.command = command.to(next(self.parameters()).device)
+
+    @torch.no_grad()
+    def add_observation_map(self, points: list[list[int]]) -> None:
+        """Let the encoder be told what the sensors should have said; starts as exactly the identity.
+
+        Args:
+            points: Pairs of leading observation entries that are the x and y of a point.
+
+        Raises:
+            ValueError: If there is one already.
+        """
+        if self.observation_map is not None:
+            raise ValueError("The model already has an observation map; add_observation_map works once.")
+        raw = int(self.sizes["decode_dim"])
+        blocks = (self.obs_dim - self.memory_dim) // raw
+        centre, unit = self.normalizer.mean[:raw], self.normalizer.var[:raw].sqrt()
+        self.observation_map = ObservationMap(points, centre, unit, blocks)
 
     @torch.no_grad()
     def update_targets(self, rate: float) -> None:

@@ -10,8 +10,11 @@ from torch import Tensor
 
 from mpc_sgft.learning.agent import Agent, floats
 from mpc_sgft.learning.dynamics import Dynamics
+from mpc_sgft.learning.fit import Maps, Penalty, fit_dynamics
 from mpc_sgft.learning.method import AbstractMethod, Gate
+from mpc_sgft.learning.observation_map import Sensed
 from mpc_sgft.learning.slices import to_slices
+from mpc_sgft.learning.world_model import WorldModel
 
 
 class SGFT(AbstractMethod):
@@ -21,17 +24,23 @@ class SGFT(AbstractMethod):
 
         J = sum_{t<H} gamma^t r_t + gamma^H V(z_H) - V(z_0)
 
-    which the planner maximises too. The command map, the anchor, the gate and the residual are ours.
+    which the planner maximises too. Both maps, the anchor, the gate and the residual are ours.
 
     Args:
         horizon: Imagined steps of the policy's objective [H].
-        lr, policy_lr, command_lr: Of Adam for dynamics, policy prior and command map.
+        lr, policy_lr, command_lr, observation_lr: Of Adam for dynamics, policy prior and the two maps.
+        lr_decay: With r rollouts they are r^-lr_decay of that, so that many rollouts do not move them about.
         entropy_coef: Weight of the policy's entropy in its objective, fixed.
         rho: Weight of step t of the dynamics loss is rho^t.
         anchor: Weight of the squared distance of the dynamics' parameters from the pretrained ones, divided by the
-            rollouts so far: a prior weighs less, the more data there are.
+            rollouts so far: a prior weighs less, the more data there are. The same for the observation map's distance
+            from the identity.
         residual: Train a correction that starts at zero on top of frozen pretrained dynamics.
         command_map: Also learn what the machine makes of a command, a few numbers that hold everywhere.
+        observation_map: Also learn what the sensors should have said: a turn of what a camera sees, a shift of each
+            entry. Found like the command map, by what the simulator's dynamics can explain, and by where rollouts
+            start: corrected, that must be where they start in simulation.
+        start_weight: Weight of the squared distance from there.
         gate, gate_margin, gate_memory: Whether there is a gate, and its numbers (`Gate`).
         updates, slice_len, action_noise: As in `AbstractMethod`.
 
@@ -53,6 +62,10 @@ class SGFT(AbstractMethod):
         anchor: float,
         residual: bool,
         command_map: bool,
+        observation_map: bool,
+        observation_lr: float,
+        start_weight: float,
+        lr_decay: float,
         gate: bool,
         gate_margin: float,
         gate_memory: int,
@@ -69,38 +82,75 @@ class SGFT(AbstractMethod):
         self.residual, self.command_map = residual, command_map
         self.gate = Gate(gate_margin, gate_memory) if gate else None
         self.updates, self.slice_len, self.action_noise = updates, slice_len, action_noise
+        self.observation_map, self.observation_lr, self.start_weight = observation_map, observation_lr, start_weight
+        self.lr_decay = lr_decay
         self._pretrained: list[Tensor] = []  # of the dynamics, where the anchor holds them
         self._simulated: Dynamics | None = None  # as they were pretrained, with the command map of those that train
 
-    def take_over(self, agent: Agent) -> None:
-        dynamics, parts = agent.model.dynamics, ("dynamics", "policy_head")
+    def take_over(self, agent: Agent, sensed: Sensed) -> None:
+        model, parts = agent.model, ("dynamics", "policy_head")
         if self.residual:
-            if dynamics.residual is None:
-                agent.model.add_residual()
+            if model.dynamics.residual is None:
+                model.add_residual()
             parts = ("dynamics.residual", "policy_head")
         if self.command_map:
-            if dynamics.command is None:
-                agent.model.add_command_map()
+            if model.dynamics.command is None:
+                model.add_command_map()
             parts += ("dynamics.command",)
-        agent.train_only(parts, lr=self.lr, policy_lr=self.policy_lr, command_lr=self.command_lr)
+        if self.observation_map:
+            if model.observation_map is None:
+                model.add_observation_map(sensed.points())
+            parts += ("observation_map",)
+        rates = {"command_lr": self.command_lr, "observation_lr": self.observation_lr}
+        agent.train_only(parts, lr=self.lr, policy_lr=self.policy_lr, **rates)
+        self._sensed = sensed
         self._pretrained = [p.detach().clone() for p in agent.dynamics_parameters()]
-        if self.command_map:
-            self._simulated = copy.deepcopy(dynamics).requires_grad_(False)
-            self._simulated.residual, self._simulated.command = None, dynamics.command
+        if self.command_map or self.observation_map:
+            self._simulated = copy.deepcopy(model.dynamics).requires_grad_(False)
+            self._simulated.residual, self._simulated.command = None, model.dynamics.command
 
     def update(
-        self, agent: Agent, batch: TensorDictBase, *, rollouts: int, weight: Tensor | None = None
+        self, agent: Agent, batch: TensorDictBase, *, starts: Tensor, weight: Tensor | None = None
     ) -> dict[str, float]:
         def distance() -> Tensor:
             moved = zip(agent.dynamics_parameters(), self._pretrained, strict=True)
             return torch.stack([(now - then).square().sum() for now, then in moved]).sum()
 
-        data = to_slices(batch, agent.device)
-        penalty = ("anchor_distance", self.anchor / rollouts, distance) if self.anchor else None
-        metrics, encoded = agent.fit_dynamics(
-            data, rho=self.rho, weight=weight, penalty=penalty, simulated=self._simulated
+        rollouts = len(starts)
+        agent.scale_learning_rates(rollouts**-self.lr_decay)
+        metrics, encoded = fit_dynamics(
+            agent,
+            to_slices(batch, agent.device),
+            rho=self.rho,
+            weight=weight,
+            penalty=Penalty("anchor_distance", self.anchor / rollouts, distance) if self.anchor else None,
+            maps=self._maps(agent.model, starts),
         )
-        return floats(metrics | agent.climb(encoded[0], horizon=self.horizon, entropy_coef=self.entropy_coef))
+        metrics |= agent.climb(encoded[0], horizon=self.horizon, entropy_coef=self.entropy_coef)
+        return floats(metrics) | self._corrections(agent.model)
+
+    def _maps(self, model: WorldModel, starts: Tensor) -> Maps | None:
+        """How command map and observation map learn, given the first observation of each rollout [R, O]."""
+        if self._simulated is None:
+            return None
+        sensors, commands = model.observation_map, self._simulated.command
+        if sensors is None:
+            return Maps((commands,), self._simulated)
+
+        def doubt() -> Tensor:
+            where = self._sensed.starts.to(starts.device)
+            far = sensors.outside(starts, where.amin(0), where.amax(0))
+            return self.start_weight * far + self.anchor / len(starts) * sensors.size()
+
+        return Maps(tuple(m for m in (commands, sensors) if m), self._simulated, Penalty("sensor_doubt", 1.0, doubt))
+
+    def _corrections(self, model: WorldModel) -> dict[str, float]:
+        """What the observation map makes of the sensors, by name: a turn [rad], shifts in raw units."""
+        sensors = model.observation_map
+        if not self.observation_map or sensors is None:
+            return {}
+        shifts = zip(self._sensed.names, (sensors.shift * sensors.unit).tolist(), strict=True)
+        return {"sensor_turn": sensors.turn.item()} | {f"sensor_shift_{name}": shift for name, shift in shifts}
 
     def state_dict(self) -> dict[str, Any]:
         simulated = self._simulated.base.state_dict() if self._simulated else None

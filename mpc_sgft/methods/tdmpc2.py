@@ -5,6 +5,7 @@ from torch import Tensor
 
 from mpc_sgft.learning.agent import PRETRAINED, Agent
 from mpc_sgft.learning.method import AbstractMethod
+from mpc_sgft.learning.observation_map import Sensed
 
 
 class TDMPC2(AbstractMethod):
@@ -19,11 +20,11 @@ class TDMPC2(AbstractMethod):
     def __init__(self, *, updates: int, slice_len: int, action_noise: float):
         self.updates, self.slice_len, self.action_noise = updates, slice_len, action_noise
 
-    def take_over(self, agent: Agent) -> None:
+    def take_over(self, agent: Agent, sensed: Sensed) -> None:
         agent.train_only(PRETRAINED, lr=agent.lr, policy_lr=agent.lr, following=("target_q",))
 
     def update(
-        self, agent: Agent, batch: TensorDictBase, *, rollouts: int, weight: Tensor | None = None
+        self, agent: Agent, batch: TensorDictBase, *, starts: Tensor, weight: Tensor | None = None
     ) -> dict[str, float]:
         if weight is not None:
             raise ValueError("method tdmpc2 weighs all slices alike; weight must be None")

@@ -5,6 +5,7 @@ from torch import Tensor
 
 from mpc_sgft.learning.agent import Agent
 from mpc_sgft.learning.method import AbstractMethod
+from mpc_sgft.learning.observation_map import Sensed
 
 
 class ZeroShot(AbstractMethod):
@@ -19,8 +20,8 @@ class ZeroShot(AbstractMethod):
     def __init__(self, *, slice_len: int, action_noise: float):
         self.slice_len, self.action_noise = slice_len, action_noise
 
-    def take_over(self, agent: Agent) -> None:
+    def take_over(self, agent: Agent, sensed: Sensed) -> None:
         agent.train_only((), lr=agent.lr, policy_lr=agent.lr)
 
-    def update(self, agent: Agent, batch: TensorDictBase, *, rollouts: int, weight: Tensor | None = None) -> dict:
+    def update(self, agent: Agent, batch: TensorDictBase, *, starts: Tensor, weight: Tensor | None = None) -> dict:
         raise ValueError("method zero_shot learns nothing: it has no update")

@@ -1,6 +1,8 @@
 """From a config to the objects of a run: the only place where names in yaml become things."""
 
+import copy
 import logging
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +16,12 @@ from envs.backends.sim import SimBackend
 from envs.env import ControlEnv
 from mpc_sgft.command.errors import UserError, from_config
 from mpc_sgft.learning.agent import Agent
+from mpc_sgft.learning.observation_map import Sensed
 from mpc_sgft.learning.world_model import WorldModel
 from mpc_sgft.storage import checkpoint
 from planners.malloc import keep_freed_memory
+
+STARTS = 64  # simulated episodes whose starts tell where real ones should
 
 
 def device(cfg: DictConfig) -> torch.device:
@@ -67,6 +72,17 @@ def make_env(
         how = {"threads": threads, "physics": cfg.physics, **noise}
         backend = SimBackend(task, num_envs, effects=present, draws=draws, **how)
     return ControlEnv(backend, history=cfg.task.history)
+
+
+def sensed(cfg: DictConfig) -> Sensed:
+    """What the task observes, and where its episodes start in simulation, without the gap."""
+    plain = copy.deepcopy(cfg)
+    OmegaConf.update(plain, "gap.effects", {}, merge=False)
+    env = make_env(plain, STARTS)
+    with closing(env.backend):
+        env.set_seed(cfg.seed)
+        starts = env.reset()["observation"][:, : env.raw_dim]
+    return Sensed(tuple(env.task.observation_names), starts)
 
 
 def make_planner(cfg: DictConfig, action_dim: int):

@@ -14,6 +14,7 @@ from envs.env import ControlEnv
 from mpc_sgft.command.errors import Stopped, UserError, disk_error, from_config
 from mpc_sgft.learning.agent import Agent
 from mpc_sgft.learning.audit import audit, write_audit
+from mpc_sgft.learning.observation_map import Sensed
 from mpc_sgft.learning.transfer import Transfer, open_loop_error
 from mpc_sgft.runs import build, robot
 from mpc_sgft.runs.collect import Score, collect, planner_policy, score, score_of
@@ -60,7 +61,7 @@ def deploy(cfg: DictConfig) -> int:
     return 0
 
 
-def make_transfer(cfg: DictConfig, agent: Agent, episode_steps: int) -> Transfer:
+def make_transfer(cfg: DictConfig, agent: Agent, sensed: Sensed, episode_steps: int) -> Transfer:
     """A pretrained agent in the hands of `cfg.method`.
 
     Raises:
@@ -71,6 +72,7 @@ def make_transfer(cfg: DictConfig, agent: Agent, episode_steps: int) -> Transfer
     return Transfer(
         agent,
         method,
+        sensed,
         capacity=(cfg.rollouts + 1) * episode_steps,
         batch_size=cfg.train.replay.batch_size,
         seed=cfg.seed,
@@ -89,7 +91,7 @@ class Deployment:
         (self.folder / "episodes").mkdir(exist_ok=True)
         build.prepare_process(cfg)
         self.planner = build.make_planner(cfg, env.action_dim)
-        self.transfer = make_transfer(cfg, agent, env.task.episode_steps)
+        self.transfer = make_transfer(cfg, agent, build.sensed(cfg), env.task.episode_steps)
         self.frozen = agent.frozen_hash()
         self.state: dict[str, Any] = {"rollouts": 0, "aborted": 0, "scores": {}, "seconds": 0.0, "successes": 0}
         self.state |= {"interventions": 0, "rerecorded": 0}

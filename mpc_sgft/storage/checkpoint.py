@@ -54,6 +54,7 @@ def describe(cfg: DictConfig, model: WorldModel, extra: Mapping[str, Any] | None
         "value_range": float(model.value_range),
         "residual": model.dynamics.residual is not None,
         "command_map": model.dynamics.command is not None,
+        "observation_map": None if model.observation_map is None else model.observation_map.points,
         "config": config,
         **(extra or {}),
     }
@@ -119,6 +120,8 @@ def load(
             model.add_residual()
         if meta.get("command_map"):
             model.add_command_map()
+        if meta.get("observation_map") is not None:
+            model.add_observation_map(meta["observation_map"])
         model.load_state_dict(tensors)
         model.value_range = float(meta.get("value_range", EARLIER_RANGE))
     except (TypeError, ValueError, RuntimeError) as err:

@@ -67,7 +67,7 @@ def relearn(cfg: DictConfig, rollouts: list[TensorDict], at: list[int]) -> tuple
     agent, _ = build.load_agent(cfg)
     judge = build.make_env(cfg, cfg.eval_episodes)
     planner = build.make_planner(cfg, judge.action_dim)
-    transfer = make_transfer(cfg, agent, judge.task.episode_steps)
+    transfer = make_transfer(cfg, agent, build.sensed(cfg), judge.task.episode_steps)
     success = {}
     bar = progress(len(rollouts), initial=0, desc="relearn", unit="rollout", disable=False)
     for count, steps in enumerate(rollouts, 1):

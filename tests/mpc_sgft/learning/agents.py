@@ -3,7 +3,10 @@
 import torch
 from tensordict import TensorDict
 
+from mpc_sgft.learning import losses
 from mpc_sgft.learning.agent import Agent
+from mpc_sgft.learning.observation_map import Sensed
+from mpc_sgft.learning.slices import to_slices
 from mpc_sgft.learning.world_model import PARTS, WorldModel
 from mpc_sgft.methods.sgft import SGFT
 from mpc_sgft.methods.tdmpc2 import TDMPC2
@@ -30,6 +33,8 @@ NUMBERS = dict(
 SHARED = dict(slice_len=3, action_noise=0.0)
 NO_GATE = dict(gate=False, gate_margin=0.9, gate_memory=5)
 OURS = dict(anchor=0.0, residual=False, command_map=False, command_lr=2e-2)
+OURS |= dict(observation_map=False, observation_lr=5e-3, start_weight=1.0, lr_decay=0.0)
+SENSED = Sensed(("tip_x", "tip_y", "height"), torch.zeros(2, 3))
 SGFT_NUMBERS = dict(
     horizon=4, lr=3e-4, policy_lr=3e-4, entropy_coef=1e-4, rho=0.5, updates=1, **SHARED, **NO_GATE, **OURS
 )
@@ -41,8 +46,10 @@ def hand_over(agent: Agent, name: str = "sgft", **changes):
         method = SGFT(**(SGFT_NUMBERS | changes))
     else:
         method = TDMPC2(updates=1, **SHARED) if name == "tdmpc2" else ZeroShot(**SHARED)
-    method.take_over(agent)
-    return lambda batch, weight=None: method.update(agent, batch, rollouts=1, weight=weight)
+    method.take_over(agent, SENSED)
+    return lambda batch, weight=None: method.update(
+        agent, batch, starts=torch.zeros(1, agent.model.obs_dim), weight=weight
+    )
 
 
 def make_agent(sizes=None, **changes) -> Agent:
@@ -71,6 +78,15 @@ def pretrained(**changes) -> Agent:
     for i in range(5):
         agent.update(make_batch(i))
     return agent
+
+
+@torch.no_grad()
+def model_error(agent: Agent, batch: TensorDict) -> torch.Tensor:
+    """Squared latent error of the dynamics after 1..T steps, [B, T]."""
+    data = to_slices(batch, agent.device)
+    encoded = agent.model.encode(data.observation)
+    zs = losses.imagine(agent.model.dynamics, encoded[0], data.action)
+    return losses.consistency_loss(zs[1:], encoded[1:]).transpose(0, 1)
 
 
 def parts(agent):

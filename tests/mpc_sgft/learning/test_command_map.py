@@ -5,6 +5,7 @@ import copy
 import pytest
 import torch
 
+from mpc_sgft.learning.fit import Maps, fit_dynamics
 from mpc_sgft.learning.slices import Slices
 from tests.mpc_sgft.learning.agents import make_agent
 
@@ -29,7 +30,7 @@ def taught(agent, simulated: bool, updates: int = 300):
         for a in action:
             z.append(machine(z[-1], a))
         data = Slices(torch.stack(z), action, torch.zeros(T, B), torch.zeros(T, B, dtype=torch.bool))
-        agent.fit_dynamics(data, rho=1.0, simulated=own if simulated else None)
+        fit_dynamics(agent, data, rho=1.0, maps=Maps((own.command,), own) if simulated else None)
     return dynamics, own
 
 

@@ -12,6 +12,7 @@ from mpc_sgft.learning.method import Gate
 from mpc_sgft.learning.transfer import Transfer, Verdict, clearly_better, open_loop_error
 from mpc_sgft.learning.world_model import WorldModel
 from mpc_sgft.methods.sgft import SGFT
+from tests.mpc_sgft.learning.agents import SENSED
 
 SIZES = {"obs_dim": 6, "action_dim": 2, "decode_dim": 3, "latent_dim": 16, "mlp_dim": 32, "enc_dim": 32, "num_q": 2}
 CONFIGS = Path(__file__).resolve().parents[3] / "configs"
@@ -25,7 +26,14 @@ def make_agent(sizes: dict | None = None, **changes) -> Agent:
 
 
 def make_sgft(**changes) -> SGFT:
-    plain = {"horizon": 2, "anchor": 0.0, "command_map": False, "slice_len": 2}
+    plain = {
+        "horizon": 2,
+        "anchor": 0.0,
+        "command_map": False,
+        "observation_map": False,
+        "lr_decay": 0.0,
+        "slice_len": 2,
+    }
     numbers = OmegaConf.load(CONFIGS / "method/sgft.yaml")
     return SGFT(**{k: (plain | changes).get(k, numbers._get_node(k)._value()) for k in numbers if k != "_target_"})
 
@@ -51,7 +59,7 @@ def rollout(model: WorldModel, steps: int = 12, seed: int = 0) -> TensorDict:
 
 def transfer(gate: bool = True, updates: int = 5, margin: float = 0.9, **changes) -> Transfer:
     method = make_sgft(lr=1e-2, gate=gate, updates=updates, gate_margin=margin)
-    return Transfer(make_agent(**changes), method, capacity=200, batch_size=16, seed=0)
+    return Transfer(make_agent(**changes), method, SENSED, capacity=200, batch_size=16, seed=0)
 
 
 def same(a: WorldModel, b: WorldModel) -> bool:
@@ -150,8 +158,8 @@ def test_a_command_map_starts_as_the_identity_and_recovers_gain_and_delay():
 def test_with_a_command_map_everything_else_stays_frozen():
     agent = make_agent(sizes=MEMORY)
     method = make_sgft(command_map=True, anchor=0.1)
-    method.take_over(agent)
+    method.take_over(agent, SENSED)
     before, frozen = agent.model.dynamics.command.weight.clone(), agent.frozen_hash()
-    method.update(agent, rollout(agent.model, 6)[:4].unflatten(0, (2, 2)), rollouts=1)
+    method.update(agent, rollout(agent.model, 6)[:4].unflatten(0, (2, 2)), starts=torch.zeros(1, agent.model.obs_dim))
     assert agent.frozen_hash() == frozen
     assert not torch.equal(before, agent.model.dynamics.command.weight)

@@ -12,6 +12,7 @@ from tensordict import TensorDict
 from mpc_sgft.command import choices, compose
 from mpc_sgft.learning.agent import Agent
 from mpc_sgft.learning.method import AbstractMethod
+from mpc_sgft.learning.observation_map import Sensed
 from mpc_sgft.learning.transfer import Transfer
 from mpc_sgft.learning.world_model import WorldModel
 from mpc_sgft.runs.deploy import make_transfer
@@ -20,7 +21,7 @@ SIZES = {"obs_dim": 6, "action_dim": 1, "decode_dim": 2, "memory_dim": 2, "laten
 SIZES |= {"enc_dim": 32, "num_q": 2}
 METHODS = choices.groups()["method"]
 # Written by the version in which Agent held every method (commit 6d50529), with the numbers below; those of sgft with a
-# command map by the version in which the map learns first.
+# command map by the version in which it learns with the simulator, with an observation map by the one that added it.
 AS_BEFORE = json.loads((Path(__file__).parent / "as_before.json").read_text())
 
 
@@ -40,7 +41,7 @@ def make(*overrides: str) -> Transfer:
     cfg = compose.compose("deploy", [compose.normalise(text) for text in given], given)
     torch.manual_seed(0)
     agent: Agent = instantiate(cfg.train.agent, model=WorldModel(**SIZES), seed=0, device="cpu", discount=0.9)
-    return make_transfer(cfg, agent, 12)
+    return make_transfer(cfg, agent, Sensed(("tip_x", "tip_y"), torch.zeros(2, 2)), 12)
 
 
 def test_every_file_is_a_method_and_every_method_has_its_numbers():

@@ -1,0 +1,93 @@
+"""One step of what learns from real data: the dynamics, and the maps of commands and observations."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from mpc_sgft.learning import losses
+from mpc_sgft.learning.agent import Agent
+from mpc_sgft.learning.dynamics import Dynamics
+from mpc_sgft.learning.precision import in_own_precision
+from mpc_sgft.learning.slices import Slices, check_finite
+
+
+class Penalty(NamedTuple):
+    """What is added to a loss."""
+
+    name: str
+    weight: float
+    value: Callable[[], Tensor]  # worked out after the loss
+
+
+class Maps(NamedTuple):
+    """How the maps learn: they explain of the data what they can together with the simulator's dynamics.
+
+    The dynamics learn the rest, with the maps as they are. Learned at once, a growing command map and shrinking
+    dynamics explain the same data, and neither holds elsewhere.
+
+    Attributes:
+        parts: What learns.
+        simulated: The simulator's dynamics, with the command map of those that train.
+        penalty: On the maps.
+    """
+
+    parts: tuple[nn.Module, ...]
+    simulated: Dynamics
+    penalty: Penalty | None = None
+
+
+@in_own_precision
+def fit_dynamics(
+    agent: Agent,
+    data: Slices,
+    *,
+    rho: float,
+    weight: Tensor | None = None,
+    penalty: Penalty | None = None,
+    maps: Maps | None = None,
+) -> tuple[dict[str, Tensor], Tensor]:
+    """One step of the dynamics toward the encoded observations; the encoder stays as it is.
+
+    Args:
+        agent: Whose dynamics train.
+        data: Slices of T steps.
+        rho: Weight of imagined step t is rho^t.
+        weight: Of each slice, [B], mean one; None weighs all alike.
+        penalty: On the dynamics.
+        maps: How the maps learn; None: what the dynamics hold of them learns with these.
+
+    Returns:
+        Metrics, and the encoded observations, [T + 1, B, D].
+
+    Raises:
+        FloatingPointError: If a loss is not finite; nothing has changed then.
+    """
+    seen = agent.model.encode(data.observation)  # [T + 1, B, D]
+    encoded = seen.detach()
+
+    def error(dynamics: nn.Module, encoded: Tensor) -> Tensor:  # its targets are no constants: the maps move them
+        zs = losses.imagine(dynamics, encoded[0], data.action)
+        return losses.over_time((zs[1:] - encoded[1:]).square().mean(-1), rho, weight)
+
+    def with_penalty(loss: Tensor, penalty: Penalty | None) -> Tensor:
+        if penalty is None:
+            return loss
+        metrics[penalty.name] = penalty.value()
+        return loss + penalty.weight * metrics[penalty.name]
+
+    metrics = {"consistency_loss": error(agent.model.dynamics, encoded)}
+    total = with_penalty(metrics["consistency_loss"], penalty)
+    if maps is not None:
+        metrics["map_loss"] = error(maps.simulated, seen)
+        of_maps = with_penalty(metrics["map_loss"], maps.penalty)
+    check_finite(metrics)
+    agent.model_optimizer.zero_grad()
+    scale = agent.weights["consistency_loss"]
+    (scale * total).backward(inputs=agent.dynamics_parameters() if maps else None)
+    if maps is not None:
+        (scale * of_maps).backward(inputs=[p for part in maps.parts for p in part.parameters()])
+    metrics["grad_norm"] = torch.nn.utils.clip_grad_norm_(agent.model_parameters, agent.grad_clip, foreach=True)
+    agent.model_optimizer.step()
+    return metrics, encoded

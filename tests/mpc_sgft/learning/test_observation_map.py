@@ -1,0 +1,90 @@
+"""The observation map finds what the sensors should have said, and is the identity until then."""
+
+import math
+from types import SimpleNamespace
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from mpc_sgft.learning.fit import Maps, Penalty, fit_dynamics
+from mpc_sgft.learning.observation_map import ObservationMap, Sensed
+from mpc_sgft.learning.slices import Slices
+from mpc_sgft.storage import checkpoint
+from tests.mpc_sgft.learning.agents import make_agent
+
+NAMES = ("tip_x", "tip_y", "height", "puck_x", "puck_y", "roll_x")
+
+
+def test_points_are_pairs_of_an_x_and_a_y():
+    assert Sensed(NAMES, torch.zeros(1, 6)).points() == [[0, 1], [3, 4]]
+
+
+def test_a_fresh_map_changes_no_bit_and_one_by_hand_turns_and_shifts():
+    centre, unit = torch.tensor([1.0, 2.0, 5.0]), torch.tensor([0.1, 0.2, 0.5])
+    sensors = ObservationMap([[0, 1]], centre, unit, blocks=2)
+    observation = torch.tensor([[2.0, 2.0, 7.0, 1.0, 3.0, 8.0, 0.3, -0.4]])  # two blocks of three, then past actions
+    assert torch.equal(sensors(observation), observation)
+    with torch.no_grad():
+        sensors.turn.fill_(math.pi / 2)
+        sensors.shift.copy_(torch.tensor([1.0, 0.0, -2.0]))
+    wanted = torch.tensor([[1.1, 3.0, 6.0, 0.1, 2.0, 7.0, 0.3, -0.4]])
+    assert torch.allclose(sensors(observation), wanted, atol=1e-6)
+    assert sensors.size().item() == pytest.approx((math.pi / 2) ** 2 + 5)
+
+
+def test_starts_count_as_far_as_they_lie_outside_the_simulated_ones():
+    sensors = ObservationMap([], torch.zeros(2), torch.tensor([0.5, 2.0]), blocks=1)
+    starts = torch.tensor([[0.5, 0.0], [2.0, -4.0]])  # one inside; one a unit and a unit and a half outside
+    low, high = torch.tensor([0.0, -1.0]), torch.tensor([1.5, 1.0])
+    assert sensors.outside(starts, low, high).item() == pytest.approx((1.0**2 + 1.5**2) / 2)
+
+
+class Slope(nn.Module):
+    """A puck that moves less the farther out it lies: so what it does tells where it is."""
+
+    def forward(self, z: Tensor, action: Tensor) -> Tensor:
+        return z + 0.3 * action / (1 + 4 * z.square())
+
+
+@pytest.mark.parametrize("told", [True, False], ids=["by dynamics", "by starts"])
+def test_a_shifted_sensor_is_found(told: bool):
+    """Observations, here their own latents, lie 0.3 and -0.2 beside the truth."""
+    agent = make_agent(sizes={"obs_dim": 2, "decode_dim": 2})
+    model, offset = agent.model, torch.tensor([0.3, -0.2])
+    model.add_observation_map([[0, 1]])
+    agent.train_only(("dynamics", "observation_map"), lr=1e-3, policy_lr=1e-3, observation_lr=5e-3)
+    sensors, machine = model.observation_map, Slope() if told else SimpleNamespace()
+    model.encode = lambda observation: sensors(observation)
+    model.dynamics.forward = lambda z, action: z + 0 * model.dynamics.base[0].linear.bias.sum()
+    generator = torch.Generator().manual_seed(0)
+    starts = torch.tensor([[0.0, 0.0], [0.1, 0.1]]) + offset
+
+    def doubt() -> Tensor:
+        return 0.0 * sensors.size() if told else sensors.outside(starts, torch.zeros(2), torch.full((2,), 0.1))
+
+    own = machine if told else lambda z, action: z.detach()
+    for _ in range(400):
+        action = 2 * torch.rand(4, 64, 2, generator=generator) - 1
+        z = [2 * torch.rand(64, 2, generator=generator) - 1]
+        for a in action:
+            z.append(Slope()(z[-1], a))
+        nothing = torch.zeros(4, 64)
+        data = Slices(torch.stack(z) + offset, action, nothing, nothing.bool())
+        fit_dynamics(agent, data, rho=1.0, maps=Maps((sensors,), own, Penalty("doubt", 1.0, doubt)))
+    assert torch.allclose(sensors.shift * sensors.unit, -offset, atol=0.02)
+    assert abs(sensors.turn.item()) < 0.05
+
+
+def test_a_map_is_saved_with_its_model(tmp_path):
+    agent = make_agent()
+    agent.model.add_observation_map([[0, 1]])
+    with torch.no_grad():
+        agent.model.observation_map.turn.fill_(0.3)
+    meta = {"format": checkpoint.FORMAT, "task": "push", "sizes": agent.model.sizes, "observation_map": [[0, 1]]}
+    checkpoint.save(tmp_path / "m.safetensors", agent.model, meta)
+    loaded = checkpoint.load(tmp_path / "m.safetensors").model
+    seen = torch.randn(3, 6)
+    assert torch.equal(loaded.encode(seen), agent.model.encode(seen))
+    with pytest.raises(ValueError, match="already"):
+        loaded.add_observation_map([])
