@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 SUFFIXES = "_x", "_y"
@@ -29,6 +30,10 @@ class ObservationMap(nn.Module):
     One camera sees all points, so the turn is theirs together; each entry has a shift of its own. There is no scale: it
     could make everything look alike, and what looks alike is easily predicted.
 
+    Only doubted entries are corrected, and points are turned only if an entry of one is. Doubt comes from where
+    episodes start: nothing has moved yet, so if it looks odd there, no dynamics can be to blame. Without that a map
+    explains whatever the dynamics do otherwise than in simulation, and moves a nail that only sits harder.
+
     Args:
         points: Pairs of entries that are the x and y of a point, [P, 2].
         centre: Where the entries lie on average, raw units [R]; points turn about their own.
@@ -38,6 +43,7 @@ class ObservationMap(nn.Module):
 
     centre: Tensor
     unit: Tensor
+    doubted: Tensor
 
     def __init__(self, points: list[list[int]], centre: Tensor, unit: Tensor, blocks: int) -> None:
         super().__init__()
@@ -46,16 +52,18 @@ class ObservationMap(nn.Module):
         self.shift = nn.Parameter(torch.zeros_like(unit))  # [R], in units
         self.register_buffer("centre", centre.clone())
         self.register_buffer("unit", unit.clone())
+        self.register_buffer("doubted", torch.zeros_like(unit))  # 0 or 1, [R]
 
     def forward(self, observation: Tensor) -> Tensor:
         """Corrected observations, [..., O] -> [..., O]; past actions stay as they are."""
         size = len(self.unit)
         seen = observation[..., : self.blocks * size].unflatten(-1, (self.blocks, size))
-        right = seen + self.shift * self.unit
+        right = seen + self.doubted * self.shift * self.unit
         if self.points:
             i, j = torch.tensor(self.points, device=seen.device).T
             x, y = (seen - self.centre)[..., i], (seen - self.centre)[..., j]
-            cos, sin = torch.cos(self.turn), torch.sin(self.turn)
+            turn = self.turn * self.doubted[torch.cat([i, j])].amax()
+            cos, sin = torch.cos(turn), torch.sin(turn)
             turned = torch.zeros_like(seen)
             turned[..., i], turned[..., j] = (cos - 1) * x - sin * y, sin * x + (cos - 1) * y
             right = right + turned
@@ -65,7 +73,19 @@ class ObservationMap(nn.Module):
         """Squared distance from the identity, scalar."""
         return self.turn.square().sum() + self.shift.square().sum()
 
+    @torch.no_grad()
+    def doubt(self, starts: Tensor, low: Tensor, high: Tensor, enough: float) -> None:
+        """Doubt the entries whose starts [N, O], as they were seen, lie outside a box by more than `enough`."""
+        self.doubted.copy_(self._outside(starts[..., : len(self.unit)], low, high) > enough)
+
     def outside(self, starts: Tensor, low: Tensor, high: Tensor) -> Tensor:
-        """Mean squared distance of corrected starts [N, O] from a box of R entries, in units, scalar."""
-        seen = self(starts)[..., : len(self.unit)]
-        return (((seen - high).clamp_min(0) + (low - seen).clamp_min(0)) / self.unit).square().sum(-1).mean()
+        """How far corrected starts [N, O] lie outside a box of R entries, in units, mean over starts, scalar.
+
+        Distances are squared up to one unit and linear beyond (Huber, 1964): an entry that hardly moved in simulation,
+        and so has a tiny unit, must not drown the others.
+        """
+        return self._outside(self(starts)[..., : len(self.unit)], low, high).sum()
+
+    def _outside(self, seen: Tensor, low: Tensor, high: Tensor) -> Tensor:
+        far = ((seen - high).clamp_min(0) + (low - seen).clamp_min(0)) / self.unit
+        return 2 * F.huber_loss(far, torch.zeros_like(far), reduction="none").mean(0)

@@ -221,7 +221,7 @@ class WorldModel(nn.Module):
             raise ValueError("The model already has an observation map; add_observation_map works once.")
         raw = int(self.sizes["decode_dim"])
         blocks = (self.obs_dim - self.memory_dim) // raw
-        centre, unit = self.normalizer.mean[:raw], self.normalizer.var[:raw].sqrt()
+        centre, unit = self.normalizer.mean[:raw], self.normalizer.std[:raw]
         self.observation_map = ObservationMap(points, centre, unit, blocks)
 
     @torch.no_grad()

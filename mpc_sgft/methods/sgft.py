@@ -16,6 +16,8 @@ from mpc_sgft.learning.observation_map import Sensed
 from mpc_sgft.learning.slices import to_slices
 from mpc_sgft.learning.world_model import WorldModel
 
+DOUBT = 1e-3  # squared distance from the simulated starts, in spreads of the entry, from which on its sensor is doubted
+
 
 class SGFT(AbstractMethod):
     """Encoder, reward and critic stay as they were pretrained; the dynamics and the policy prior train.
@@ -38,8 +40,8 @@ class SGFT(AbstractMethod):
         residual: Train a correction that starts at zero on top of frozen pretrained dynamics.
         command_map: Also learn what the machine makes of a command, a few numbers that hold everywhere.
         observation_map: Also learn what the sensors should have said: a turn of what a camera sees, a shift of each
-            entry. Found like the command map, by what the simulator's dynamics can explain, and by where rollouts
-            start: corrected, that must be where they start in simulation.
+            entry, once rollouts start where none does in simulation. Found like the command map, by what the
+            simulator's dynamics can explain, and by where rollouts start.
         start_weight: Weight of the squared distance from there.
         gate, gate_margin, gate_memory: Whether there is a gate, and its numbers (`Gate`).
         updates, slice_len, action_noise: As in `AbstractMethod`.
@@ -137,9 +139,12 @@ class SGFT(AbstractMethod):
         if sensors is None:
             return Maps((commands,), self._simulated)
 
+        simulated = self._sensed.starts.to(starts.device)
+        box = simulated.amin(0), simulated.amax(0)
+        sensors.doubt(starts, *box, DOUBT)
+
         def doubt() -> Tensor:
-            where = self._sensed.starts.to(starts.device)
-            far = sensors.outside(starts, where.amin(0), where.amax(0))
+            far = sensors.outside(starts, *box)
             return self.start_weight * far + self.anchor / len(starts) * sensors.size()
 
         return Maps(tuple(m for m in (commands, sensors) if m), self._simulated, Penalty("sensor_doubt", 1.0, doubt))
@@ -149,7 +154,7 @@ class SGFT(AbstractMethod):
         sensors = model.observation_map
         if not self.observation_map or sensors is None:
             return {}
-        shifts = zip(self._sensed.names, (sensors.shift * sensors.unit).tolist(), strict=True)
+        shifts = zip(self._sensed.names, (sensors.doubted * sensors.shift * sensors.unit).tolist(), strict=True)
         return {"sensor_turn": sensors.turn.item()} | {f"sensor_shift_{name}": shift for name, shift in shifts}
 
     def state_dict(self) -> dict[str, Any]:

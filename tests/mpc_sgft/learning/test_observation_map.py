@@ -27,6 +27,7 @@ def test_a_fresh_map_changes_no_bit_and_one_by_hand_turns_and_shifts():
     assert torch.equal(sensors(observation), observation)
     with torch.no_grad():
         sensors.turn.fill_(math.pi / 2)
+        sensors.doubted.fill_(1.0)
         sensors.shift.copy_(torch.tensor([1.0, 0.0, -2.0]))
     wanted = torch.tensor([[1.1, 3.0, 6.0, 0.1, 2.0, 7.0, 0.3, -0.4]])
     assert torch.allclose(sensors(observation), wanted, atol=1e-6)
@@ -37,7 +38,26 @@ def test_starts_count_as_far_as_they_lie_outside_the_simulated_ones():
     sensors = ObservationMap([], torch.zeros(2), torch.tensor([0.5, 2.0]), blocks=1)
     starts = torch.tensor([[0.5, 0.0], [2.0, -4.0]])  # one inside; one a unit and a unit and a half outside
     low, high = torch.tensor([0.0, -1.0]), torch.tensor([1.5, 1.0])
-    assert sensors.outside(starts, low, high).item() == pytest.approx((1.0**2 + 1.5**2) / 2)
+    assert sensors.outside(starts, low, high).item() == pytest.approx((1.0**2 + 2 * 1.5 - 1) / 2)
+
+
+def test_only_what_starts_elsewhere_is_corrected_and_points_turn_together():
+    sensors = ObservationMap([[0, 1]], torch.zeros(4), torch.ones(4), blocks=1)
+    with torch.no_grad():
+        sensors.turn.fill_(math.pi)
+        sensors.shift.fill_(0.5)
+    starts, low, high = torch.zeros(2, 4), -torch.ones(4), torch.ones(4)
+    observation = torch.ones(1, 4)
+    sensors.doubt(starts, low, high, 0.01)
+    assert torch.equal(sensors(observation), observation)
+    starts[0, 2] = 1.2  # 0.2 outside, once of twice: 0.02
+    sensors.doubt(starts, low, high, 0.03)
+    assert torch.equal(sensors(observation), observation)
+    sensors.doubt(starts, low, high, 0.01)
+    assert sensors(observation).tolist() == [[1.0, 1.0, 1.5, 1.0]]
+    starts[1, 0] = -2.0
+    sensors.doubt(starts, low, high, 0.01)
+    assert torch.allclose(sensors(observation), torch.tensor([[-0.5, -1.0, 1.5, 1.0]]), atol=1e-6)
 
 
 class Slope(nn.Module):
@@ -54,6 +74,7 @@ def test_a_shifted_sensor_is_found(told: bool):
     model, offset = agent.model, torch.tensor([0.3, -0.2])
     model.add_observation_map([[0, 1]])
     agent.train_only(("dynamics", "observation_map"), lr=1e-3, policy_lr=1e-3, observation_lr=5e-3)
+    model.observation_map.doubted.fill_(1.0)
     sensors, machine = model.observation_map, Slope() if told else SimpleNamespace()
     model.encode = lambda observation: sensors(observation)
     model.dynamics.forward = lambda z, action: z + 0 * model.dynamics.base[0].linear.bias.sum()
@@ -81,6 +102,7 @@ def test_a_map_is_saved_with_its_model(tmp_path):
     agent.model.add_observation_map([[0, 1]])
     with torch.no_grad():
         agent.model.observation_map.turn.fill_(0.3)
+        agent.model.observation_map.doubted[0] = 1.0
     meta = {"format": checkpoint.FORMAT, "task": "push", "sizes": agent.model.sizes, "observation_map": [[0, 1]]}
     checkpoint.save(tmp_path / "m.safetensors", agent.model, meta)
     loaded = checkpoint.load(tmp_path / "m.safetensors").model
