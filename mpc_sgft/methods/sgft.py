@@ -103,8 +103,13 @@ class SGFT(AbstractMethod):
             if model.observation_map is None:
                 model.add_observation_map(sensed.points())
             parts += ("observation_map",)
-        rates = {"command_lr": self.command_lr, "observation_lr": self.observation_lr}
-        agent.train_only(parts, lr=self.lr, policy_lr=self.policy_lr, **rates)
+        agent.train_only(
+            parts,
+            lr=self.lr,
+            policy_lr=self.policy_lr,
+            command_lr=self.command_lr,
+            observation_lr=self.observation_lr,
+        )
         self._sensed = sensed
         self._pretrained = [p.detach().clone() for p in agent.dynamics_parameters()]
         if self.command_map or self.observation_map:
@@ -135,10 +140,11 @@ class SGFT(AbstractMethod):
         """How command map and observation map learn, given the first observation of each rollout [R, O]."""
         if self._simulated is None:
             return None
-        sensors, commands = model.observation_map, self._simulated.command
+        commands = self._simulated.command if self.command_map else None
+        sensors = model.observation_map if self.observation_map else None
+        parts = tuple(part for part in (commands, sensors) if part is not None)
         if sensors is None:
-            return Maps((commands,), self._simulated)
-
+            return Maps(parts, self._simulated)
         simulated = self._sensed.starts.to(starts.device)
         box = simulated.amin(0), simulated.amax(0)
         sensors.doubt(starts, *box, DOUBT)
@@ -147,7 +153,7 @@ class SGFT(AbstractMethod):
             far = sensors.outside(starts, *box)
             return self.start_weight * far + self.anchor / len(starts) * sensors.size()
 
-        return Maps(tuple(m for m in (commands, sensors) if m), self._simulated, Penalty("sensor_doubt", 1.0, doubt))
+        return Maps(parts, self._simulated, Penalty("sensor_doubt", 1.0, doubt))
 
     def _corrections(self, model: WorldModel) -> dict[str, float]:
         """What the observation map makes of the sensors, by name: a turn [rad], shifts in raw units."""
