@@ -255,6 +255,7 @@ def exact() -> str:
 STUDIES: dict[str, Callable[[], str]] = {
     "pretrain": pretrain,
     "transfer": transfer,
+    "outside": lambda: curves(read("outside/sgft.csv"), lambda r: f"`{r['gap']}`, {r['method']}", "gap and method"),
     "tasks": tasks,
     "ablation": lambda: curves(read("ablation/ablation.csv"), left_out, "gap, and what is left out"),
     "horizon": lambda: curves(read("horizon/horizon.csv"), lambda r: r["variant"], "variant"),
