@@ -54,16 +54,25 @@ class ObservationMap(nn.Module):
         self.register_buffer("unit", unit.clone())
         self.register_buffer("doubted", torch.zeros_like(unit))  # 0 or 1, [R]
 
+    @property
+    def turned(self) -> Tensor:
+        """By how much points are turned [rad], [1]."""
+        return self.turn * self.doubted[sum(self.points, [])].amax() if self.points else torch.zeros_like(self.turn)
+
+    @property
+    def shifted(self) -> Tensor:
+        """By how much entries are shifted, raw units [R]."""
+        return self.doubted * self.shift * self.unit
+
     def forward(self, observation: Tensor) -> Tensor:
         """Corrected observations, [..., O] -> [..., O]; past actions stay as they are."""
         size = len(self.unit)
         seen = observation[..., : self.blocks * size].unflatten(-1, (self.blocks, size))
-        right = seen + self.doubted * self.shift * self.unit
+        right = seen + self.shifted
         if self.points:
             i, j = torch.tensor(self.points, device=seen.device).T
             x, y = (seen - self.centre)[..., i], (seen - self.centre)[..., j]
-            turn = self.turn * self.doubted[torch.cat([i, j])].amax()
-            cos, sin = torch.cos(turn), torch.sin(turn)
+            cos, sin = torch.cos(self.turned), torch.sin(self.turned)
             turned = torch.zeros_like(seen)
             turned[..., i], turned[..., j] = (cos - 1) * x - sin * y, sin * x + (cos - 1) * y
             right = right + turned

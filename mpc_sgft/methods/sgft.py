@@ -160,8 +160,8 @@ class SGFT(AbstractMethod):
         sensors = model.observation_map
         if not self.observation_map or sensors is None:
             return {}
-        shifts = zip(self._sensed.names, (sensors.doubted * sensors.shift * sensors.unit).tolist(), strict=True)
-        return {"sensor_turn": sensors.turn.item()} | {f"sensor_shift_{name}": shift for name, shift in shifts}
+        shifts = zip(self._sensed.names, sensors.shifted.tolist(), strict=True)
+        return {"sensor_turn": sensors.turned.item()} | {f"sensor_shift_{name}": shift for name, shift in shifts}
 
     def state_dict(self) -> dict[str, Any]:
         simulated = self._simulated.base.state_dict() if self._simulated else None

@@ -1,7 +1,6 @@
 """The observation map finds what the sensors should have said, and is the identity until then."""
 
 import math
-from types import SimpleNamespace
 
 import pytest
 import torch
@@ -75,7 +74,7 @@ def test_a_shifted_sensor_is_found(told: bool):
     model.add_observation_map([[0, 1]])
     agent.train_only(("dynamics", "observation_map"), lr=1e-3, policy_lr=1e-3, observation_lr=5e-3)
     model.observation_map.doubted.fill_(1.0)
-    sensors, machine = model.observation_map, Slope() if told else SimpleNamespace()
+    sensors = model.observation_map
     model.encode = lambda observation: sensors(observation)
     model.dynamics.forward = lambda z, action: z + 0 * model.dynamics.base[0].linear.bias.sum()
     generator = torch.Generator().manual_seed(0)
@@ -84,7 +83,7 @@ def test_a_shifted_sensor_is_found(told: bool):
     def doubt() -> Tensor:
         return 0.0 * sensors.size() if told else sensors.outside(starts, torch.zeros(2), torch.full((2,), 0.1))
 
-    own = machine if told else lambda z, action: z.detach()
+    own = Slope() if told else lambda z, action: z.detach()
     for _ in range(400):
         action = 2 * torch.rand(4, 64, 2, generator=generator) - 1
         z = [2 * torch.rand(64, 2, generator=generator) - 1]
