@@ -92,9 +92,9 @@ class SimBackend:
         self._last: dict[str, Array] = {}
         self.seed(0)
         for effect in self.effects:  # a parameter that does not fit the task stops here, not in the first episode
-            effect.command(np.zeros((1, task.action_dim)), task)
-            self._change(np.zeros((1, nominal.nu)))
             nothing = np.zeros((1, len(task.observation_names)))
+            effect.command(np.zeros((1, task.action_dim)), task, nothing)
+            self._change(np.zeros((1, nominal.nu)))
             effect.sense(nothing, lambda _, same=nothing: same, lambda k: np.zeros((1, k)), task)
 
     def seed(self, seed: int) -> None:
@@ -134,9 +134,9 @@ class SimBackend:
 
     def send(self, action: Array) -> Outcome:
         sent = np.clip(action, -1.0, 1.0)
-        realised = sent
+        realised, truth = sent, self.task.observe(self.qpos, self.qvel)
         for effect in self.effects:
-            realised = effect.command(realised, self.task)
+            realised = effect.command(realised, self.task, truth)
         self.target = self.task.move(self.target, realised)
         before = self.told
         ramp = np.linspace(0, 1, self.steps + 1)[1:, None]

@@ -31,7 +31,7 @@ class ActuatorGain(Effect):
             require_linear(actuator, "actuator_gain")
             actuator.gainprm[:3] *= gains[actuator.name]
 
-    def command(self, action: Array, task: AbstractTask) -> Array:
+    def command(self, action: Array, task: AbstractTask, truth: Array) -> Array:
         return action if self.at else action * per_axis(self.gain, action.shape[1], "actuator_gain.gain")
 
     def ctrl(self, ctrl: Array, actuators: list[str]) -> Array:

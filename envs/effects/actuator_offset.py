@@ -39,7 +39,7 @@ class ActuatorOffset(Effect):
                 actuator.biastype, actuator.biasprm[:3] = mujoco.mjtBias.mjBIAS_AFFINE, [0.0, 0.0, 0.0]
             actuator.biasprm[0] += actuator.gainprm[0] * offsets[actuator.name]
 
-    def command(self, action: Array, task: AbstractTask) -> Array:
+    def command(self, action: Array, task: AbstractTask, truth: Array) -> Array:
         return action if self.at else action + per_axis(self.offset, action.shape[1], "actuator_offset.offset")
 
     def ctrl(self, ctrl: Array, actuators: list[str]) -> Array:

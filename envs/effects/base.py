@@ -54,8 +54,14 @@ class Effect:
     def edit_spec(self, spec: mujoco.MjSpec) -> None:
         """Change the scene before it is compiled."""
 
-    def command(self, action: Array, task: AbstractTask) -> Array:
-        """Change the action [N, A] between the interface and the machine."""
+    def command(self, action: Array, task: AbstractTask, truth: Array) -> Array:
+        """Change an action between the interface and the machine, [N, A].
+
+        Args:
+            action: In [-1, 1], what effects before made of it, [N, A].
+            task: Whose action.
+            truth: What its sensors should read when the action begins, [N, O].
+        """
         return action
 
     def ctrl(self, ctrl: Array, actuators: list[str]) -> Array:

@@ -29,7 +29,7 @@ class Deadband(Effect):
         if not self.at and self.width > 1:
             raise ValueError(f"Deadband.width={self.width} of the largest action: allowed are 0.0 to 1.0")
 
-    def command(self, action: Array, task: AbstractTask) -> Array:
+    def command(self, action: Array, task: AbstractTask, truth: Array) -> Array:
         return action if self.at else self._beyond(action)
 
     def ctrl(self, ctrl: Array, actuators: list[str]) -> Array:

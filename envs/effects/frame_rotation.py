@@ -31,7 +31,7 @@ class FrameRotation(Effect):
         if self.at not in ("base", "camera"):
             raise ValueError(f"FrameRotation.at={self.at!r}; allowed: base, camera")
 
-    def command(self, action: Array, task: AbstractTask) -> Array:
+    def command(self, action: Array, task: AbstractTask, truth: Array) -> Array:
         if self.at != "base":
             return action
         if not task.moves_in_plane:

@@ -35,12 +35,16 @@ class AbstractMethod(ABC):
         slice_len: Consecutive steps of a slice of the replay [T].
         action_noise: Standard deviation of the noise on real actions, action units.
         gate: When fine-tuned parts may act; None: at once.
+        average_decay: Of the averaged weights that are tested and act, per update; 0: the last ones.
+        policy_share: Of the way from the pretrained policy prior to the fine-tuned one that acts.
     """
 
     updates: int
     slice_len: int
     action_noise: float
     gate: Gate | None = None
+    average_decay: float = 0.0
+    policy_share: float = 1.0
 
     @abstractmethod
     def take_over(self, agent: Agent, sensed: Sensed) -> None:

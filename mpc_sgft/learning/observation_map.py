@@ -84,8 +84,11 @@ class ObservationMap(nn.Module):
 
     @torch.no_grad()
     def doubt(self, starts: Tensor, low: Tensor, high: Tensor, enough: float) -> None:
-        """Doubt the entries whose starts [N, O], as they were seen, lie outside a box by more than `enough`."""
-        self.doubted.copy_(self._outside(starts[..., : len(self.unit)], low, high) > enough)
+        """Doubt the entries whose starts [N, O], as they were seen, lie outside a box by more than `enough` in sum.
+
+        A sum: one start that is clearly outside stays so, however many lie within.
+        """
+        self.doubted.copy_(self._outside(starts[..., : len(self.unit)], low, high).sum(0) > enough)
 
     def outside(self, starts: Tensor, low: Tensor, high: Tensor) -> Tensor:
         """How far corrected starts [N, O] lie outside a box of R entries, in units, mean over starts, scalar.
@@ -93,8 +96,8 @@ class ObservationMap(nn.Module):
         Distances are squared up to one unit and linear beyond (Huber, 1964): an entry that hardly moved in simulation,
         and so has a tiny unit, must not drown the others.
         """
-        return self._outside(self(starts)[..., : len(self.unit)], low, high).sum()
+        return self._outside(self(starts)[..., : len(self.unit)], low, high).mean(0).sum()
 
     def _outside(self, seen: Tensor, low: Tensor, high: Tensor) -> Tensor:
         far = ((seen - high).clamp_min(0) + (low - seen).clamp_min(0)) / self.unit
-        return 2 * F.huber_loss(far, torch.zeros_like(far), reduction="none").mean(0)
+        return 2 * F.huber_loss(far, torch.zeros_like(far), reduction="none")

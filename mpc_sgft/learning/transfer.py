@@ -4,7 +4,9 @@ The dynamics and the policy that act are not simply the ones that train. A model
 transitions of five rollouts has forgotten what it knew elsewhere, and where zero-shot already worked that does harm. So
 each new rollout is first a test: it has not been trained on, and the pretrained and the fine-tuned dynamics both
 predict it. The fine-tuned parts act once they have predicted such rollouts clearly better; until then the pretrained
-do.
+do. What is tested and acts is the average of the weights over the last updates, since the last ones alone are one draw
+of many; of the policy prior, a share of the way from the pretrained one (Wortsman et al., "Robust fine-tuning of
+zero-shot models", CVPR 2022).
 """
 
 import copy
@@ -17,6 +19,7 @@ import torch
 from tensordict import TensorDict
 
 from mpc_sgft.learning.agent import Agent
+from mpc_sgft.learning.averaged import AveragedWeights
 from mpc_sgft.learning.buffer import make_buffer
 from mpc_sgft.learning.method import AbstractMethod
 from mpc_sgft.learning.observation_map import Sensed
@@ -51,6 +54,7 @@ class Transfer:
         self._new_buffer = partial(make_buffer, **sizes, seed=seed, device=agent.device)
         self.buffer = self._new_buffer()
         self.pretrained = copy.deepcopy(agent.model)
+        self.averaged = AveragedWeights(agent.model, method.average_decay)
         self.acting: WorldModel = copy.deepcopy(agent.model)
         self.verdicts: list[Verdict] = []
         self.starts: list[torch.Tensor] = []  # first observation of each rollout
@@ -59,7 +63,7 @@ class Transfer:
         """Test both dynamics on a rollout [T] before it is learned from, and decide who acts next."""
         pretrained, fine_tuned = (
             float(open_loop_error(model, steps, self.slice_len).nanmean())
-            for model in (self.pretrained, self.agent.model)
+            for model in (self.pretrained, self.averaged.model)
         )
         gate = self.method.gate
         self.verdicts.append(Verdict(pretrained, fine_tuned, gate is None))
@@ -81,14 +85,22 @@ class Transfer:
         starts, metrics = torch.stack(self.starts), dict[str, float]()
         for _ in track(range(self.method.updates)):
             metrics = self.method.update(self.agent, self.buffer.sample(), starts=starts)
-        self.acting.load_state_dict((self.agent.model if verdict.accepted else self.pretrained).state_dict())
+            self.averaged.follow(self.agent.model)
+        self._hand_over(verdict.accepted)
         return metrics | {"error_pretrained": verdict.pretrained, "error_fine_tuned": verdict.fine_tuned}
+
+    @torch.no_grad()
+    def _hand_over(self, accepted: bool) -> None:
+        self.acting.load_state_dict((self.averaged.model if accepted else self.pretrained).state_dict())
+        priors = self.acting.policy_head.parameters(), self.pretrained.policy_head.parameters()
+        torch._foreach_lerp_([*priors[0]], [*priors[1]], 1 - self.method.policy_share)  # type: ignore
 
     def state_dict(self) -> dict:
         return {
             "agent": self.agent.state_dict(),
             "method": self.method.state_dict(),
             "buffer": self.buffer.state_dict(),
+            "averaged": self.averaged.state_dict(),
             "acting": self.acting.state_dict(),
             "starts": [x.clone() for x in self.starts],
             "verdicts": [tuple(v) for v in self.verdicts],
@@ -99,6 +111,7 @@ class Transfer:
         self.method.load_state_dict(state["method"])
         self.buffer = self._new_buffer()  # what is loaded may hold less than what is there
         self.buffer.load_state_dict(state["buffer"])
+        self.averaged.load_state_dict(state["averaged"])
         self.acting.load_state_dict(state["acting"])
         self.starts = [x.to(self.agent.device) for x in state["starts"]]
         self.verdicts = [Verdict(*v) for v in state["verdicts"]]

@@ -16,7 +16,9 @@ from mpc_sgft.learning.observation_map import Sensed
 from mpc_sgft.learning.slices import to_slices
 from mpc_sgft.learning.world_model import WorldModel
 
-DOUBT = 1e-3  # squared distance from the simulated starts, in spreads of the entry, from which on its sensor is doubted
+DOUBT = (
+    0.03  # squared distances of all starts from the simulated ones, in spreads of an entry, that its sensor may have
+)
 
 
 class SGFT(AbstractMethod):
@@ -44,7 +46,7 @@ class SGFT(AbstractMethod):
             simulator's dynamics can explain, and by where rollouts start.
         start_weight: Weight of the squared distance from there.
         gate, gate_margin, gate_memory: Whether there is a gate, and its numbers (`Gate`).
-        updates, slice_len, action_noise: As in `AbstractMethod`.
+        updates, slice_len, action_noise, average_decay, policy_share: As in `AbstractMethod`.
 
     Raises:
         ValueError: If the horizon is not positive or rho lies outside (0, 1].
@@ -68,6 +70,8 @@ class SGFT(AbstractMethod):
         observation_lr: float,
         start_weight: float,
         lr_decay: float,
+        average_decay: float,
+        policy_share: float,
         gate: bool,
         gate_margin: float,
         gate_memory: int,
@@ -85,7 +89,7 @@ class SGFT(AbstractMethod):
         self.gate = Gate(gate_margin, gate_memory) if gate else None
         self.updates, self.slice_len, self.action_noise = updates, slice_len, action_noise
         self.observation_map, self.observation_lr, self.start_weight = observation_map, observation_lr, start_weight
-        self.lr_decay = lr_decay
+        self.lr_decay, self.average_decay, self.policy_share = lr_decay, average_decay, policy_share
         self._pretrained: list[Tensor] = []  # of the dynamics, where the anchor holds them
         self._simulated: Dynamics | None = None  # as they were pretrained, with the command map of those that train
 

@@ -16,7 +16,7 @@ def test_the_folder_holds_what_the_project_promises() -> None:
         "actuator_gain actuator_offset actuator_delay actuator_lag viscous_friction coulomb_friction payload "
         "contact_friction sensor_offset sensor_noise sensor_delay frame_rotation state_torque asymmetric_friction "
         "stribeck_friction load_dependent_friction quadratic_drag armature torque_saturation deadband backlash "
-        "joint_stiffness gravity_tilt contact_softness sensor_gain"
+        "joint_stiffness gravity_tilt contact_softness sensor_gain directional_gain local_gain"
     )
     assert set(promised.split()) <= set(NAMES)
 
@@ -106,6 +106,12 @@ def test_values_out_of_bounds_are_refused(effect, message) -> None:
         ("push", {"torque_saturation": {"at": ["motor"]}}, "No actuator 'motor' in this scene"),
         ("push", {"actuator_gain": {"gain": [1, 1, 1]}}, "actuator_gain.gain=.*3 numbers; give one, or 2"),
         ("push", {"actuator_offset": {"offset": [0, 0, 0]}}, "actuator_offset.offset=.*3 numbers; give one, or 2"),
+        ("push", {"directional_gain": {"negative": [1, 1, 1]}}, "directional_gain.negative=.*3 numbers"),
+        (
+            "push",
+            {"local_gain": {"slope": 1.0, "at": "tip_z"}},
+            "No observation 'tip_z' in this scene. Available: tip_x",
+        ),
         ("push", {"sensor_offset": {"offset": [0, 0]}}, "sensor_offset.offset=.*2 numbers; give one, or 4"),
         ("pendulum", {"frame_rotation": {"at": "base"}}, "actions of pendulum are no displacements"),
         ("pendulum", {"frame_rotation": {"at": "camera"}}, "pendulum observes cos, sin, velocity, not points"),

@@ -92,13 +92,13 @@ def test_reward_and_success_know_the_truth(make_backend) -> None:
 def test_a_turned_base_moves_along_turned_axes(make_task) -> None:
     task = make_task("push")
     (effect,) = load({"frame_rotation": {"angle": np.pi / 2}})
+    seen = np.array([[0.1, 0.2, 0.3, 0.4]])
     np.testing.assert_allclose(
-        effect.command(np.array([[1.0, 0.0], [0.0, 0.5]]), task), [[0, 1], [-0.5, 0]], atol=1e-12
+        effect.command(np.array([[1.0, 0.0], [0.0, 0.5]]), task, seen), [[0, 1], [-0.5, 0]], atol=1e-12
     )
     (effect,) = load({"frame_rotation": {"angle": 0.6}})
-    seen = np.array([[0.1, 0.2, 0.3, 0.4]])
     assert effect.sense(seen, lambda s: seen, np.zeros, task) is seen  # the camera is right
-    np.testing.assert_allclose(effect.command(np.array([[1.0, 0.0]]), task), [[np.cos(0.6), np.sin(0.6)]])
+    np.testing.assert_allclose(effect.command(np.array([[1.0, 0.0]]), task, seen), [[np.cos(0.6), np.sin(0.6)]])
 
 
 def test_the_arm_goes_where_a_turned_base_points(make_env, play) -> None:

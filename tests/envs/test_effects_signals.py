@@ -90,6 +90,15 @@ def test_deadband_takes_its_width_off_every_signal() -> None:
         _load(deadband={"width": 0.2, "at": ["c"]}).ctrl(signals, ["a", "b"])
 
 
+def test_gains_differ_by_direction_and_by_place(make_task) -> None:
+    task, told = make_task("push"), np.array([[1.0, -0.5], [-1.0, 0.0], [0.5, 1.0]])
+    truth = np.array([[0.3, 0.0, 0.0, 0.0], [0.5, 0.0, 0.0, 0.0], [0.9, 0.0, 0.0, 0.0]])
+    by_direction = _load(directional_gain={"positive": [0.5, 1.0], "negative": [1.0, 2.0]})
+    np.testing.assert_allclose(by_direction.command(told, task, truth), [[0.5, -1.0], [-1.0, 0.0], [0.25, 1.0]])
+    by_place = _load(local_gain={"slope": -3.0, "centre": 0.5, "at": "tip_x"})
+    np.testing.assert_allclose(by_place.command(told, task, truth), [[1.6, -0.8], [-1.0, 0.0], [0.0, 0.0]])
+
+
 @pytest.mark.parametrize(
     "gap",
     [
@@ -99,6 +108,7 @@ def test_deadband_takes_its_width_off_every_signal() -> None:
         {"torque_saturation": {"limit": 1.5, "at": ["torque"]}},
         {"deadband": {"width": 0.25}},  # of the largest action
         {"actuator_gain": {"gain": 0.75}},
+        {"directional_gain": {"positive": 0.75, "negative": 3.0}},
     ],
 )
 def test_a_task_s_drive_gives_less_than_it_is_told(make_backend, gap) -> None:
@@ -109,6 +119,16 @@ def test_a_task_s_drive_gives_less_than_it_is_told(make_backend, gap) -> None:
         backend.send(np.ones((2, 1)))
     np.testing.assert_allclose(backend._last["force"][:, -1, 0], 1.5, atol=1e-6)
     np.testing.assert_allclose(backend._last["ctrl"][:, -1, 0], 2.0)
+
+
+def test_a_local_gain_is_that_of_the_place_where_an_action_begins(make_backend) -> None:
+    backend = make_backend("pendulum", 2, effects_={"local_gain": {"slope": 0.1, "centre": 1.0, "at": "cos"}})
+    backend.reset(np.arange(2))
+    for _ in range(3):
+        cos = np.cos(backend.qpos[:, 0])
+        backend.send(np.ones((2, 1)))
+        realised = backend.task.max_torque * (1 + 0.1 * (cos - 1))
+        np.testing.assert_allclose(backend._last["force"][:, -1, 0], realised, atol=1e-6)
 
 
 def test_signals_of_recorded_data_are_read_as_a_sensor_would() -> None:

@@ -58,6 +58,7 @@ class ServoCommands:
         self.substeps = whole_steps(task.control_dt, task.sim_dt)
         longest = max(len(e.action) for e in episodes)
         self.action = np.stack([_padded(e.action, longest) for e in episodes], 1)  # [T, E, A]
+        self.seen = np.stack([_padded(e.observation[:-1], longest) for e in episodes], 1)  # [T, E, O]
         self.first = np.stack([e.q[0] for e in episodes])  # [E, nj]
 
     @property
@@ -86,19 +87,19 @@ class ServoCommands:
         first = np.tile(self.first, (count, 1))
         target = self.task.hold(first)
         told = [self.task.ctrl(target, first)]
-        for sent in self.action:
+        for sent, seen in zip(self.action, self.seen, strict=True):
             realised = np.tile(sent, (count, 1))
             for k, effects in enumerate(changes):
                 mine = slice(k * size, (k + 1) * size)
                 for effect in effects:
-                    realised[mine] = effect.command(realised[mine], self.task)
+                    realised[mine] = effect.command(realised[mine], self.task, seen)
             target = self.task.move(target, realised)
             told.append(self.task.ctrl(target, told[-1]))
         return np.stack(told, 1).reshape(count, size, len(told), -1)
 
 
-def _padded(action: Array, length: int) -> Array:
-    return np.concatenate([action, np.zeros((length - len(action), action.shape[1]))])
+def _padded(rows: Array, length: int) -> Array:
+    return np.concatenate([rows, np.zeros((length - len(rows), rows.shape[1]))])
 
 
 def _delayed(u: Array, first: Array, steps: float) -> Array:

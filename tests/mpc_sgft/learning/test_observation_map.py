@@ -49,13 +49,16 @@ def test_only_what_starts_elsewhere_is_corrected_and_points_turn_together():
     observation = torch.ones(1, 4)
     sensors.doubt(starts, low, high, 0.01)
     assert torch.equal(sensors(observation), observation)
-    starts[0, 2] = 1.2  # 0.2 outside, once of twice: 0.02
-    sensors.doubt(starts, low, high, 0.03)
+    starts[0, 2] = 1.2  # 0.2 outside, once: 0.04 in sum
+    sensors.doubt(starts, low, high, 0.05)
     assert torch.equal(sensors(observation), observation)
-    sensors.doubt(starts, low, high, 0.01)
+    sensors.doubt(starts, low, high, 0.03)
+    assert sensors(observation).tolist() == [[1.0, 1.0, 1.5, 1.0]]
+    starts = torch.cat([starts, torch.zeros(20, 4)])  # many within take nothing back
+    sensors.doubt(starts, low, high, 0.03)
     assert sensors(observation).tolist() == [[1.0, 1.0, 1.5, 1.0]]
     starts[1, 0] = -2.0
-    sensors.doubt(starts, low, high, 0.01)
+    sensors.doubt(starts, low, high, 0.03)
     assert torch.allclose(sensors(observation), torch.tensor([[-0.5, -1.0, 1.5, 1.0]]), atol=1e-6)
 
 

@@ -32,6 +32,8 @@ def make_sgft(**changes) -> SGFT:
         "command_map": False,
         "observation_map": False,
         "lr_decay": 0.0,
+        "average_decay": 0.0,
+        "policy_share": 1.0,
         "slice_len": 2,
     }
     numbers = OmegaConf.load(CONFIGS / "method/sgft.yaml")
@@ -57,8 +59,10 @@ def rollout(model: WorldModel, steps: int = 12, seed: int = 0) -> TensorDict:
     )
 
 
-def transfer(gate: bool = True, updates: int = 5, margin: float = 0.9, **changes) -> Transfer:
-    method = make_sgft(lr=1e-2, gate=gate, updates=updates, gate_margin=margin)
+def transfer(
+    gate: bool = True, updates: int = 5, margin: float = 0.9, of_method: dict | None = None, **changes
+) -> Transfer:
+    method = make_sgft(lr=1e-2, gate=gate, updates=updates, gate_margin=margin, **(of_method or {}))
     return Transfer(make_agent(**changes), method, SENSED, capacity=200, batch_size=16, seed=0)
 
 
@@ -99,15 +103,36 @@ def test_without_the_gate_what_trains_acts_at_once():
     assert same(t.acting, t.agent.model) and not same(t.acting, t.pretrained)
 
 
+def test_what_acts_is_the_average_of_the_last_updates_with_a_share_of_the_policy_s_change():
+    decay, share, updates = 0.5, 0.25, 3
+    t = transfer(gate=False, updates=updates, of_method={"average_decay": decay, "policy_share": share})
+    seen, follow = [], t.averaged.follow
+
+    def note(model: WorldModel) -> None:
+        seen.append([p.detach().clone() for p in model.parameters()])
+        follow(model)
+
+    t.averaged.follow = note
+    t.learn(rollout(t.pretrained))
+    assert len(seen) == updates
+    for k, (name, acts) in enumerate(t.acting.named_parameters()):
+        average = 0.25 * seen[0][k] + 0.25 * seen[1][k] + 0.5 * seen[2][k]
+        before = t.pretrained.get_parameter(name)
+        wanted = before + share * (average - before) if name.startswith("policy_head.") else average
+        assert torch.allclose(acts, wanted, atol=1e-6), name
+    assert not same(t.acting, t.averaged.model)
+
+
 def test_a_saved_transfer_goes_on_with_the_same_numbers():
-    once, twice = transfer(), transfer()
+    once, twice = (transfer(of_method={"average_decay": 0.9, "policy_share": 0.5}) for _ in range(2))
     for t in (once, twice):
         t.learn(rollout(t.pretrained, seed=1))
-    again = transfer()
+    again = transfer(of_method={"average_decay": 0.9, "policy_share": 0.5})
     again.load_state_dict(twice.state_dict())
     once.learn(rollout(once.pretrained, seed=2))
     again.learn(rollout(again.pretrained, seed=2))
     assert same(once.agent.model, again.agent.model) and once.verdicts == again.verdicts
+    assert same(once.averaged.model, again.averaged.model) and same(once.acting, again.acting)
 
 
 def test_open_loop_error_by_hand():

@@ -62,8 +62,9 @@ def test_a_new_file_is_looked_for_and_named(cubic_drag: None, slide: Path, recor
 
 def test_what_a_recording_cannot_show_is_no_candidate() -> None:
     assert possible() == list(TABLE)  # every file has a row, but for these
-    assert [n for n in available() if n not in TABLE] == ["frame_rotation", "sensor_noise", "state_torque"]
-    assert facts_of("state_torque") is facts_of("sensor_noise") is facts_of("frame_rotation") is None
+    without = ["directional_gain", "frame_rotation", "local_gain", "sensor_noise", "state_torque"]
+    assert [n for n in available() if n not in TABLE] == without
+    assert all(facts_of(name) is None for name in without)
 
 
 @pytest.mark.parametrize(
