@@ -42,9 +42,10 @@ class SimBackend:
         noise_probability: Share of episodes that are noisy.
         threads: Simulation threads; 0 takes all cores that this process may use. They do not change the results.
         physics: `mujoco` on threads, or `warp`: MuJoCo Warp, on a GPU where there is one.
+        reward: Of the `truth`, or of what is `observed`, as on a robot. Success is always that of the truth.
 
     Raises:
-        ValueError: For an effect or a draw that does not fit the task, or physics that is not installed.
+        ValueError: For an effect or a draw that does not fit the task, physics that is not installed, or another reward.
     """
 
     def __init__(
@@ -58,7 +59,10 @@ class SimBackend:
         noise_probability: float = 0.0,
         threads: int = 0,
         physics: str = "mujoco",
+        reward: str = "truth",
     ):
+        if reward not in ("truth", "observed"):
+            raise ValueError(f"backend.reward={reward!r}; allowed: truth, observed")
         self.task, self.num_envs, self.effects = task, num_envs, effects or []
         spec = task.spec()
         self.nominal = nominal = spec.copy().compile()
@@ -74,7 +78,7 @@ class SimBackend:
         self.told = np.zeros((num_envs, nominal.nu))  # control signals before the effects that change them
         self.hides_commands = any(type(e).command is not Effect.command for e in self.effects)
         self.randomizer = Randomizer(self.batch, self.model, draws or [])
-        self.noise_sd, self.noise_probability = noise_sd, noise_probability
+        self.noise_sd, self.noise_probability, self.believes = noise_sd, noise_probability, reward == "observed"
         self.steps = whole_steps(task.control_dt, task.sim_dt)
         self.has_force = any(type(e).force is not Effect.force for e in self.effects)
         self.dry = LoadFriction(self.batch, nominal, self.effects)
@@ -151,9 +155,10 @@ class SimBackend:
             self.past.insert(0, (moved["qpos"].copy(), moved["qvel"].copy()))
             del self.past[int(MAX_PAST / self.task.control_dt) + 1 :]
         truth = self.task.observe(self.qpos, self.qvel)
+        seen = self._sense(truth, np.arange(self.num_envs))
         return Outcome(
-            observation=self._sense(truth, np.arange(self.num_envs)),
-            reward=self.task.reward(truth, sent),
+            observation=seen,
+            reward=self.task.reward(seen if self.believes else truth, sent),
             success=self.task.success(truth),
             terminated=self.task.terminated(truth),
             action_sent=sent,

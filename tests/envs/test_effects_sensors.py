@@ -79,14 +79,20 @@ def test_effects_act_in_their_order(make_backend) -> None:
     np.testing.assert_allclose(_episode(make_backend, gap)[1], late + 0.05, atol=1e-12)
 
 
-def test_reward_and_success_know_the_truth(make_backend) -> None:
-    for gap in ({}, {"sensor_offset": {"offset": 0.3}}):
-        backend = make_backend("push", 2, effects_=gap)
-        backend.seed(0)
-        backend.reset(np.arange(2))
-        out = backend.send(np.full((2, 2), 0.5))
-        truth = backend.task.observe(backend.qpos, backend.qvel)
-        np.testing.assert_allclose(out.reward, backend.task.reward(truth, out.action_sent))
+@pytest.mark.parametrize("reward", ["truth", "observed"])
+def test_reward_is_that_of_the_truth_unless_it_is_asked_for_as_observed(make_backend, reward) -> None:
+    backend = make_backend("push", 2, effects_={"sensor_offset": {"offset": [0.1, 0.0, 0.3, 0.0]}}, reward=reward)
+    backend.seed(0)
+    backend.reset(np.arange(2))
+    out = backend.send(np.full((2, 2), 0.5))
+    truth = backend.task.observe(backend.qpos, backend.qvel)
+    rewards = {"truth": backend.task.reward(truth, out.action_sent)}
+    rewards["observed"] = backend.task.reward(truth + [0.1, 0.0, 0.3, 0.0], out.action_sent)
+    np.testing.assert_allclose(out.reward, rewards[reward])
+    assert (np.abs(rewards["truth"] - rewards["observed"]) > 0.01).all()
+    np.testing.assert_array_equal(out.success, backend.task.success(truth))
+    with pytest.raises(ValueError, match="reward='seen'; allowed: truth, observed"):
+        make_backend("push", reward="seen")
 
 
 def test_a_turned_base_moves_along_turned_axes(make_task) -> None:

@@ -33,3 +33,14 @@ def test_a_shipped_agent_does_its_task_and_knows_the_range_of_its_values(task: s
     agent, meta = build.load_agent(cfg)
     assert agent.model.value_range == meta["value_range"] > 1
     assert measure(cfg, agent, episodes=8).success >= 0.85
+
+
+def test_a_simulated_reality_rewards_what_is_observed_where_that_is_asked_for() -> None:
+    for name, given, believes in (
+        ("deploy", ["backend.reward=observed"], True),
+        ("deploy", [], False),
+        ("pretrain", [], False),
+    ):
+        assert build.make_env(compose.compose(name, given, []), 1).backend.believes is believes
+    with pytest.raises(UserError, match="backend.reward='seen'; allowed: truth, observed"):
+        build.make_env(compose.compose("evaluate", ["backend.reward=seen"], []), 1)
