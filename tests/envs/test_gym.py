@@ -16,7 +16,7 @@ from envs.gym import GymEnv, GymVectorEnv
 ROOT = Path(__file__).resolve().parents[2]
 
 
-@pytest.mark.parametrize("task", ["push", "pendulum"])
+@pytest.mark.parametrize("task", ["push", "pendulum", "walker_walk", "cheetah_run"])
 def test_gymnasium_checks_the_environment(make_env, task) -> None:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")

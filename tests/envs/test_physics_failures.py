@@ -60,7 +60,7 @@ def test_the_episode_after_a_failure_is_like_any_other(make_env, play, random_ac
     assert torch.equal(play(failed, actions, 5)["observation"], play(whole, actions, 5)["observation"])
 
 
-@pytest.mark.parametrize("task", ["push", "pendulum"])
+@pytest.mark.parametrize("task", ["push", "pendulum", "walker_walk", "cheetah_run"])
 def test_random_episodes_stay_stable(make_env, random_actions, task) -> None:
     env = make_env(task, 16, randomised=True, history=1)
     env.set_seed(0)
