@@ -45,7 +45,7 @@ class SimBackend:
         reward: Of the `truth`, or of what is `observed`, as on a robot. Success is always that of the truth.
 
     Raises:
-        ValueError: For an effect or a draw that does not fit the task, physics that is not installed, or another reward.
+        ValueError: For an effect or a draw that does not fit the task, or for other physics or another reward.
     """
 
     def __init__(

@@ -307,6 +307,7 @@ class Deployment:
             "evaluation_episodes": scores[max(scores)]["episodes"],
             "rollouts_to_90": min(reached) if reached else None,
             "curve": {str(k): s["success"] for k, s in scores.items()},
+            "return_curve": {str(k): s["episode_return"] for k, s in scores.items()},
             "horizon": cfg.planner.horizon,
             "frozen_sha256": self.frozen,
             "wall_seconds": round(time.monotonic() - self.began, 1),

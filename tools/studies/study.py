@@ -15,7 +15,7 @@ from pathlib import Path
 
 from tools.studies.runner import each, finished, first_mean, write
 
-COLUMNS = ["gap", "method", "variant", "seed", "rollouts", "success", "episodes", "audit", "frozen_sha256"]
+COLUMNS = ["gap", "method", "variant", "seed", "rollouts", "success", "return", "episodes", "audit", "frozen_sha256"]
 AUDITED = 5  # rollouts, the first, whose mean improvability share stands in each row as `audit`
 
 
@@ -63,6 +63,7 @@ def main() -> None:
             **r,
             "rollouts": k,
             "success": s,
+            "return": r.get("return_curve", {}).get(k),  # runs of earlier versions did not say it
             "episodes": r["evaluation_episodes"],
             "frozen_sha256": r["frozen_sha256"][:12],
         }

@@ -91,6 +91,11 @@ def test_the_summary_holds_what_scripts_read(deployed):
     assert set(NEEDED) <= set(summary)
     assert summary["real_rollouts"] == 4 and summary["gap"] == "pendulum_torque"
     assert len(list((deployed / "episodes").glob("*.mcap"))) == 4
+    told = {row["step"]: float(row["return"]) for row in rows(deployed) if row["return"]}
+    returns = summary["return_curve"]
+    assert (
+        told and {step: returns[step] for step in told} == pytest.approx(told) and set(returns) == set(summary["curve"])
+    )
 
 
 def test_deployment_freezes_what_it_must(pretrained, deployed):
