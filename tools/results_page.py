@@ -103,6 +103,17 @@ def tasks() -> str:
     return f"{simulated}\n\n" + curves(rows, lambda r: f"`{r['gap']}`, {r['method']}", "gap and method")
 
 
+def audit() -> str:
+    (found,) = read("audit/auc.csv")
+    area = f"{percent(found['auc'])} [{percent(found['low'])}, {percent(found['high'])}]"
+    runs = pick(
+        read("audit/runs.csv"),
+        {"gap": "gap", "seed": "seed", "improvable": ("share", percent), "best success": ("best", percent)},
+    )
+    head = ["area under the curve", "runs", "of gaps", "reached 90 %"]
+    return table(head, [[area, found["runs"], found["gaps"], found["reached"]]]) + "\n\n" + runs
+
+
 def left_out(row: Row) -> str:
     """The gap of a row and what its variant leaves out."""
     changes = [change.split("=")[0].split(".")[-1] for change in row["variant"].split()]
@@ -257,6 +268,7 @@ STUDIES: dict[str, Callable[[], str]] = {
     "transfer": transfer,
     "outside": lambda: curves(read("outside/sgft.csv"), lambda r: f"`{r['gap']}`, {r['method']}", "gap and method"),
     "tasks": tasks,
+    "audit": audit,
     "ablation": lambda: curves(read("ablation/ablation.csv"), left_out, "gap, and what is left out"),
     "horizon": lambda: curves(read("horizon/horizon.csv"), lambda r: r["variant"], "variant"),
     "pendulum": lambda: curves(read("pendulum/pendulum.csv"), lambda r: r["method"], "method"),

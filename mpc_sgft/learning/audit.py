@@ -1,4 +1,4 @@
-"""The improvability audit on real data: can SGFT work here, and where can it not?"""
+"""Where on real data the frozen value can be improved, for those who look; it foretells no success (results/audit)."""
 
 import csv
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The SGFT potential: shaped rewards, and the audit that says whether shaping can work on the states seen.
+"""The SGFT potential: shaped rewards, and the audit that says in which of the states seen it can be improved.
 
 Source: Yin, Westenbroek et al., "Rapidly Adapting Policies to the Real World via Simulation-Guided Fine-Tuning", ICLR
 2025, Definition 1; Ng, Harada, Russell 1999 for potential-based shaping.

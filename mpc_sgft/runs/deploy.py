@@ -255,7 +255,6 @@ class Deployment:
                 success=result.success,
                 **{"return": result.episode_return},
                 model_error=metrics.get("model_error_1"),
-                audit_share=metrics.get("audit_share"),
                 planner_ms=metrics.get("planner_ms"),
                 seconds=time.monotonic() - self.began,
             )

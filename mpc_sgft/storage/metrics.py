@@ -201,7 +201,6 @@ EVALUATION_COLUMNS = (
     Column("success", "success", "{:.0%}"),
     Column("return", "return", "{:.2f}"),
     Column("model error", "model_error", "{:.4f}"),
-    Column("audit share", "audit_share", "{:.0%}"),
     Column("planner ms", "planner_ms", "{:.1f}"),
     Column("seconds", "seconds", "{:.0f}"),
 )

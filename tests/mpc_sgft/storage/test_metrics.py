@@ -123,14 +123,14 @@ def test_progress_shows_count_time_left_and_numbers(monkeypatch):
 def test_table_prints_the_header_once_and_columns_line_up():
     screen = io.StringIO()
     table = GrowingTable(file=screen)
-    table.row(rollouts=0, success=0.34, model_error=0.01234, audit_share=None, planner_ms=21.04, seconds=3.2)
+    table.row(rollouts=0, success=0.34, model_error=0.01234, planner_ms=21.04, seconds=3.2)
     table.row(rollouts=15, success=1.0, **{"return": -3.456}, model_error=float("nan"))
     lines = screen.getvalue().splitlines()
     assert [cell.strip() for cell in lines[0].split("|")] == [
-        "rollouts", "success", "return", "model error", "audit share", "planner ms", "seconds"
+        "rollouts", "success", "return", "model error", "planner ms", "seconds"
     ]  # fmt: skip
-    assert [cell.strip() for cell in lines[2].split("|")] == ["0", "34%", "-", "0.0123", "-", "21.0", "3"]
-    assert [cell.strip() for cell in lines[3].split("|")] == ["15", "100%", "-3.46", "-", "-", "-", "0"]
+    assert [cell.strip() for cell in lines[2].split("|")] == ["0", "34%", "-", "0.0123", "21.0", "3"]
+    assert [cell.strip() for cell in lines[3].split("|")] == ["15", "100%", "-3.46", "-", "-", "0"]
     assert len(lines) == 4 and len({len(line) for line in lines}) == 1
     with pytest.raises(ValueError, match="sucess"):
         table.row(sucess=1)
