@@ -138,9 +138,11 @@ class SimBackend:
 
     def send(self, action: Array) -> Outcome:
         sent = np.clip(action, -1.0, 1.0)
-        realised, truth = sent, self.task.observe(self.qpos, self.qvel)
-        for effect in self.effects:
-            realised = effect.command(realised, self.task, truth)
+        realised = sent
+        if self.hides_commands:
+            before = self.task.observe(self.qpos, self.qvel)
+            for effect in self.effects:
+                realised = effect.command(realised, self.task, before)
         self.target = self.task.move(self.target, realised)
         before = self.told
         ramp = np.linspace(0, 1, self.steps + 1)[1:, None]

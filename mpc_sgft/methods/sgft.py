@@ -16,9 +16,7 @@ from mpc_sgft.learning.observation_map import Sensed
 from mpc_sgft.learning.slices import to_slices
 from mpc_sgft.learning.world_model import WorldModel
 
-DOUBT = (
-    0.03  # squared distances of all starts from the simulated ones, in spreads of an entry, that its sensor may have
-)
+DOUBT = 0.03  # sum of squared distances from the simulated starts, in spreads of an entry, beyond which it is doubted
 
 
 class SGFT(AbstractMethod):
