@@ -68,14 +68,15 @@ def test_one_joint_is_told_from_all_by_its_force(deployed) -> None:
 
 
 def test_a_weak_drive_shows_as_a_slope_over_the_command(deployed) -> None:
-    found = diagnose_run(deployed({"actuator_gain": {"gain": 0.7}}), effects=["actuator_gain"])
+    run = deployed({"actuator_gain": {"gain": 0.7}}, steps=20)  # later the arm is stretched, and elsewhere than meant
+    found = diagnose_run(run, effects=["actuator_gain"])
     law = found.laws.laws[0]
     now, last = law.along
     assert law.where.startswith("drive/") and [now[0], last[0]] == [
         "commanded change",
         "commanded change, a step before",
     ]
-    assert np.polyfit(now[1], law.before, 1)[0] == pytest.approx(-0.3, abs=0.25)  # the arm stands elsewhere, too
+    assert np.polyfit(now[1], law.before, 1)[0] == pytest.approx(-0.3, abs=0.25)
     assert law.after is not None and np.std(law.after) < 0.05 * np.std(law.before)
 
 
