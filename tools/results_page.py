@@ -184,7 +184,8 @@ def timing() -> str:
     plan = {name: name for name in ("what", "size", "precision", "horizon", "rows", "threads")}
     plan = {**plan, "median ms": "median_ms", "share of peak": "share_of_peak", "to upstream": "ratio_to_upstream"}
     diagnose = {"what": "what", "s of data": "seconds_of_data", "names": "names", "wall s": "wall_s", "per unit": "per"}
-    env = {"what": "what", "physics steps / s": "physics_steps_per_s", "ControlEnv / this": "control_env_over_this"}
+    env = {"task": "task", "what": "what", "physics steps / s": "physics_steps_per_s"}
+    env |= {"control steps / s": "control_steps_per_s", "ControlEnv / this": "control_env_over_this"}
     pairs = (("time_planner", plan), ("time_diagnose", diagnose), ("benchmark_env", env))
     parts = [pick(read(f"timing/{file}.csv"), columns) for file, columns in pairs]
     profile = {name: name for name in ("size", "precision", "operation", "ms", "calls")}
