@@ -19,7 +19,7 @@ class Draw:
 
     Attributes:
         fields: MjModel fields, with an optional last index: `geom_friction[0]`.
-        at: Names of the rows to write (bodies, geoms, joints or actuators, by the field's prefix); all if empty.
+        at: Names of the rows to write (bodies, geoms, joints, actuators, tendons, by the field's prefix); all if empty.
         operation: `add` to, `scale`, or `set` the nominal value.
         low, high: Range of the draw, in the field's unit.
         distribution: `uniform` or `loguniform`.
@@ -121,7 +121,8 @@ def _locate(model: mujoco.MjModel, field: str, at: tuple[str, ...]) -> tuple[str
     name = match[1] if match else field
     if not match or not hasattr(model, name):
         raise ValueError(f"MjModel has no field {field!r} to randomise")
-    kinds = {"body": "body", "geom": "geom", "dof": "joint", "jnt": "joint", "actuator": "actuator"}
+    kinds = {"body": "body", "geom": "geom", "dof": "joint", "jnt": "joint"}
+    kinds |= {"actuator": "actuator", "tendon": "tendon"}
     prefix = name.split("_")[0]
     if prefix not in kinds:
         raise ValueError(f"field {field!r}: only fields of {', '.join(kinds)} can be randomised")

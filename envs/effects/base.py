@@ -34,7 +34,7 @@ class Effect:
 
     Attributes:
         native: True if an MJCF after `edit_spec` carries the whole effect, so that plain MuJoCo shows it.
-        place: Kind of the elements that `at` names: joint, actuator, body, geom, signal, or "" for the whole scene.
+        place: Kind of the elements that `at` names: joint, actuator, body, geom, tendon, signal; "": the whole scene.
         units: Unit of each numeric parameter.
         bounds: Physically sensible range of each numeric parameter; values outside are refused.
     """

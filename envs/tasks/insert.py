@@ -5,15 +5,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from envs import fr3, kinematics
-from envs.fixture import add_fixture
+from envs.fixture import add_table_with_hole
 from envs.task import AbstractTask, Array, Start, ValuePlane, View, whole_steps
 
 BELOW = 0.08  # [m] from the hand to the leg's end
 REST = np.array([0.0, -0.1, 0.0, -2.3, 0.0, 2.2, 0.785])  # [rad]
 TOP = 0.10  # [m] height of the table above the robot's base
 START = 0.10  # [m] of the leg's end above the table, at the start
-WALLS = 12  # boxes around the hole
-WALL, EDGE = 0.05, 0.12  # [m] width of their ring, and from the hole to the table's edges
 LOW, HIGH = np.array([0.35, -0.15, TOP - 0.05]), np.array([0.65, 0.15, TOP + 0.2])  # [m] where the leg's end may go
 NSAMPLE = 500  # physics steps of command history that the model holds, so that a delay is a parameter
 
@@ -81,34 +79,8 @@ class Insert(AbstractTask):
             conaffinity=0,
         )
         fr3.allow_delays(spec, NSAMPLE)
-        self._add_table(spec)
+        add_table_with_hole(spec, radius=self.leg_radius * self.clearance, floor=TOP - self.depth, top=TOP)
         return spec
-
-    def _add_table(self, spec: mujoco.MjSpec) -> None:
-        """A round hole of boxes that stand around its floor, in the middle of a square table."""
-        table = add_fixture(spec, "table", "x y yaw")
-        radius, floor, top = self.leg_radius * self.clearance, TOP - self.depth, TOP / 2
-        across, half = radius + WALL / 2, (radius + WALL) * np.tan(np.pi / WALLS)
-        boxes = [([radius, radius, floor / 2], [0, 0, floor / 2], 0.0)]
-        for angle in 2 * np.pi * np.arange(WALLS) / WALLS:
-            boxes.append(([WALL / 2, half, top], [across * np.cos(angle), across * np.sin(angle), top], angle))
-        inner, low = 0.7 * (radius + WALL), top - 0.0002  # corners within the ring; a hair lower, so that one is seen
-        width, away = (EDGE - inner) / 2, (EDGE + inner) / 2
-        for side in (-1, 1):
-            boxes.append(([width, EDGE, low], [side * away, 0, low], 0.0))
-            boxes.append(([inner, width, low], [0, side * away, low], 0.0))
-        for i, (size, place, angle) in enumerate(boxes):
-            table.add_geom(
-                name=f"table_{i}",
-                type=mujoco.mjtGeom.mjGEOM_BOX,
-                size=size,
-                pos=place,
-                quat=[np.cos(angle / 2), 0, 0, np.sin(angle / 2)],
-                mass=0.1,
-                rgba=[0.80, 0.74, 0.64, 1],
-                contype=0,
-                conaffinity=fr3.OBJECT_BIT,
-            )
 
     def home(self) -> Array:
         """Joint angles [1, 7] with the leg above the middle of the table; computed once."""

@@ -16,7 +16,7 @@ def test_the_folder_holds_what_the_project_promises() -> None:
         "actuator_gain actuator_offset actuator_delay actuator_lag viscous_friction coulomb_friction payload "
         "contact_friction sensor_offset sensor_noise sensor_delay frame_rotation state_torque asymmetric_friction "
         "stribeck_friction load_dependent_friction quadratic_drag armature torque_saturation deadband backlash "
-        "joint_stiffness gravity_tilt contact_softness sensor_gain directional_gain local_gain"
+        "joint_stiffness gravity_tilt contact_softness sensor_gain directional_gain local_gain rope_length"
     )
     assert set(promised.split()) <= set(NAMES)
 
@@ -104,6 +104,7 @@ def test_values_out_of_bounds_are_refused(effect, message) -> None:
         ("push", {"load_dependent_friction": {"at": ["elbow"]}}, "No joint 'elbow' in this scene. Available: joint1"),
         ("push", {"sensor_gain": {"gain": [1, 1]}}, "sensor_gain.gain=.*2 numbers; give one, or 4"),
         ("push", {"torque_saturation": {"at": ["motor"]}}, "No actuator 'motor' in this scene"),
+        ("rope_peg_in_hole", {"rope_length": {"at": ["rope9"]}}, "No tendon 'rope9' in this scene. Available: rope0"),
         ("push", {"actuator_gain": {"gain": [1, 1, 1]}}, "actuator_gain.gain=.*3 numbers; give one, or 2"),
         ("push", {"actuator_offset": {"offset": [0, 0, 0]}}, "actuator_offset.offset=.*3 numbers; give one, or 2"),
         ("push", {"directional_gain": {"negative": [1, 1, 1]}}, "directional_gain.negative=.*3 numbers"),

@@ -6,7 +6,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 
-TASKS = ["push", "pendulum", "hammer", "insert", "push_towel", "push_ball", "walker_walk", "cheetah_run"]
+TASKS = "push pendulum hammer insert rope_peg_in_hole push_towel push_ball walker_walk cheetah_run".split()
 
 
 def _shape(env, steps):

@@ -160,7 +160,7 @@ def test_loguniform_spreads_over_magnitudes() -> None:
         ({"fields": ["body_colour"]}, "no field 'body_colour'"),
         ({"fields": ["geom_friction[9]"], "at": []}, "geom_friction has the shape"),
         ({"fields": ["body_mass[0]"]}, "body_mass has the shape"),
-        ({"fields": ["qpos0"]}, "only fields of body, geom, dof, jnt, actuator"),
+        ({"fields": ["qpos0"]}, "only fields of body, geom, dof, jnt, actuator, tendon"),
         ({"at": ["pucks"]}, "randomise body_mass: .*pucks.*puck"),
     ],
 )

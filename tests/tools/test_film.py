@@ -34,7 +34,7 @@ def test_an_episode_keeps_several_positions_of_each_step() -> None:
     assert np.abs(seen.qpos[0, 7:] - again.qpos[0, 7:]).max() < 1e-6  # the puck starts at the same place
 
 
-@pytest.mark.parametrize("task", ["push", "hammer", "insert", "walker_walk", "cheetah_run"])
+@pytest.mark.parametrize("task", ["push", "hammer", "insert", "rope_peg_in_hole", "walker_walk", "cheetah_run"])
 def test_the_camera_stands_where_the_task_says(task: str) -> None:
     task_ = build.make_env(compose.compose("evaluate", [f"task={task}"], []), 1).task
     camera = camera_of(task_)

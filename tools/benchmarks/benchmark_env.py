@@ -1,9 +1,9 @@
 """ControlEnv.step at N = 64 beside raw MuJoCo on two threads: the same scene, states, commands and physics steps.
 
-    python -m tools.benchmarks.benchmark_env [--tasks push hammer] [--repeats 7] [--out results/timing/benchmark_env.csv]
+    python -m tools.benchmarks.benchmark_env [--tasks push hammer ...] [--repeats 7]
 
-For each task, as it is pretrained: one episode of random actions in 64 environments is run through `ControlEnv.step`, and its commands and first states are
-kept. Then, in turn and in this one process:
+For each task, as it is pretrained: one episode of random actions in 64 environments is run through `ControlEnv.step`,
+and its commands and first states are kept. Then, in turn and in this one process:
 
     control_env   the episode again through `ControlEnv.step` (commands are ramps; the reset is not counted)
     raw_mj_step   two Python threads, 32 environments each, one `mj_step(model, data, nstep)` a control step with the
@@ -35,7 +35,7 @@ from mpc_sgft.storage.run_folder import cpu_name
 
 ROOT = Path(__file__).resolve().parents[2]
 N, THREADS, BAR = 64, 2, 0.8
-TASKS = ["push", "push_edge", "push_towel", "push_ball", "hammer", "insert", "walker_walk", "cheetah_run", "pendulum"]
+TASKS = "push push_towel push_ball hammer insert rope_peg_in_hole walker_walk cheetah_run pendulum".split()
 STATE = mujoco.mjtState.mjSTATE_INTEGRATION
 
 

@@ -36,8 +36,8 @@ def facts_of(name: str) -> EffectFacts | None:
 @cache
 def _facts_from_units(kind: type[Effect]) -> EffectFacts | None:
     """One parameter for each field, neutral at its default, as large as force, speed and travel make its unit."""
-    if all(getattr(kind, hook) is getattr(Effect, hook) for hook in HOOKS):
-        return None
+    if kind.place == "tendon" or all(getattr(kind, hook) is getattr(Effect, hook) for hook in HOOKS):
+        return None  # recordings do not name tendons
     parameters = {}
     for f in fields(kind):
         size, neutral = size_from_unit(kind.units.get(f.name, "")), f.default

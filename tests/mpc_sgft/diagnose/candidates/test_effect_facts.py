@@ -62,7 +62,7 @@ def test_a_new_file_is_looked_for_and_named(cubic_drag: None, slide: Path, recor
 
 def test_what_a_recording_cannot_show_is_no_candidate() -> None:
     assert possible() == list(TABLE)  # every file has a row, but for these
-    without = ["directional_gain", "frame_rotation", "local_gain", "sensor_noise", "state_torque"]
+    without = ["directional_gain", "frame_rotation", "local_gain", "rope_length", "sensor_noise", "state_torque"]
     assert [n for n in available() if n not in TABLE] == without
     assert all(facts_of(name) is None for name in without)
 
