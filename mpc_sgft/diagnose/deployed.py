@@ -41,7 +41,7 @@ MOST = 64  # windows
 ASTRAY = 4.0  # mean square of a joint's error, in units of what noise and contacts make: that joint is suspected alone
 UNITS = {"observation": "of the observation", "drive": "of the control", "qpos": "rad"}
 EFFORT = Effort(
-    beam=(2,), full=(5, 4, 3), screen_windows=16, quick_windows=16, enough=1.0, pairs=0, exchange=0, most=1000
+    beam=(2,), full=(5, 4, 3), starts=2, screen_windows=16, quick_windows=16, enough=1.0, pairs=0, exchange=0, most=1000
 )
 
 

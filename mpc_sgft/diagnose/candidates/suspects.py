@@ -7,6 +7,7 @@ is a new row.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -115,23 +116,25 @@ def _one(
     return Suspect(effect, (at,) if at else (), (name,), (neutral,), (size,), (low,), (high,), points, write)
 
 
-def _offsets(effect: str, size: float, high: float, names: Sequence[str], at: tuple[str, ...]) -> Suspect:
-    """A constant on each of some axes; fits start with all at once, up and down."""
+def _offsets(
+    effect: str, size: float, high: float, names: Sequence[str], at: tuple[str, ...], signs: Sequence[Sequence[int]]
+) -> Suspect:
+    """A constant on each of some axes; fits start with all at once, with these signs."""
 
     def write(values: Array) -> dict[str, Any]:
         return {"offset": [float(v) for v in values], **({"at": list(at)} if at else {})}
 
     p = len(names)
-    starts = tuple((sign * size,) * p for sign in (1, -1))
+    starts = tuple(tuple(size * sign for sign in some) for some in signs)
     labels = tuple(f"offset_{n}" for n in names)
     return Suspect(effect, at, labels, (0.0,) * p, (size,) * p, (-high,) * p, (high,) * p, starts, write)
 
 
 def _commands(task: AbstractTask) -> list[Suspect]:
-    axes = [str(i + 1) for i in range(task.action_dim)]
+    axes = [str(i + 1) for i in range(task.action_dim)]  # against a wrong sign commands run into a limit: all are tried
     found = [
         _one("actuator_gain", "gain", 0.2, (0.9, 0.6, 1.2), neutral=1.0, low=0.05, high=3.0),
-        _offsets("actuator_offset", 0.05, 1.0, axes, ()),
+        _offsets("actuator_offset", 0.05, 1.0, axes, (), list(itertools.product((1, -1), repeat=len(axes)))),
         _one("deadband", "width", 0.1, (0.05, 0.2), high=0.9),
         _one("actuator_delay", "delay", 0.05, (0.02, 0.1, 0.3), high=0.95),
         _one("actuator_lag", "time_constant", 0.05, (0.03, 0.15), high=2.0),
@@ -188,7 +191,7 @@ def _sensors(task: AbstractTask) -> list[Suspect]:
     found = [
         _one("sensor_gain", "gain", 0.05, (0.97, 1.03), neutral=1.0, low=0.2, high=3.0),
         _one("sensor_delay", "delay", 0.05, (0.02, 0.1), high=1.0),
-        *(_offsets("sensor_offset", 0.01, 1.0, group, tuple(group)) for group in groups.values()),
+        *(_offsets("sensor_offset", 0.01, 1.0, g, tuple(g), [[1] * len(g), [-1] * len(g)]) for g in groups.values()),
     ]
     if task.moves_in_plane and len(names) % 2 == 0:
         starts = (0.05, -0.05)

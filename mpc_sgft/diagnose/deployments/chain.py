@@ -19,7 +19,7 @@ from envs.task import AbstractTask
 from mpc_sgft.diagnose.candidates.library import Term
 from mpc_sgft.diagnose.data.measured import Array, Index
 from mpc_sgft.diagnose.data.smooth import noise_of
-from mpc_sgft.diagnose.deployments.command_link import ServoCommands, measured_drive
+from mpc_sgft.diagnose.deployments.command_link import ServoCommands, measured_drive, saturated
 from mpc_sgft.diagnose.deployments.motion_link import JOINT_SAMPLES, Motion, StepWindows, acts_on_command, at_times
 from mpc_sgft.diagnose.deployments.recordings import Deployment, joint_columns
 
@@ -38,7 +38,7 @@ class Prediction(NamedTuple):
     """What K models predict; J is JOINT_SAMPLES.
 
     Attributes:
-        drive: Change of control, [K, W, n J, nu].
+        drive: Change of control, [K, W, n J, nu]; as measured where a servo gave all the force that it can.
         joints: Error of the joints, [K, W, n J, nj].
         observation: At the end of each control step, [K, W, n, O].
     """
@@ -76,6 +76,9 @@ class Chain:
         self.times = task.control_dt * w.start[:, None] + within  # [W, 1 + n JOINT_SAMPLES] since the episode's start
         told = [at_times(self.episodes[i].time, measured[i], t) for i, t in zip(w.episode, self.times, strict=True)]
         self.drive = changes_since_start(np.stack(told))
+        spent = [saturated(model, e).astype(float) for e in self.episodes]
+        spent = [at_times(self.episodes[i].time, spent[i], t) for i, t in zip(w.episode, self.times, strict=True)]
+        self.untold = np.stack(spent)[:, 1:] + np.stack(spent)[:, :1] > 0  # of `drive`, by a servo at its limit
         self.observed = np.stack([self.episodes[i].observation[s + 1 : s + 1 + length] for i, s in pairs])
         self._cache: dict[tuple[object, ...], tuple[Array, ...]] = {}
         self._scales(deployment, measured, rest)
@@ -94,7 +97,7 @@ class Chain:
 
     def predict(self, changes: Sequence[tuple[Effect, ...]], pick: Index) -> Prediction:
         """What sets of effects predict; results of a link are kept for sets that do not differ in it."""
-        drive = self._drive(changes)[:, pick]
+        drive = np.where(self.untold[pick], self.drive[pick], self._drive(changes)[:, pick])
         moved = [self._motion(e, pick) for e in changes]
         joints, observation = (np.stack(parts) for parts in zip(*moved, strict=True))
         return Prediction(drive, joints, observation)
@@ -163,8 +166,11 @@ class Chain:
         w, m = self.windows, self.motion
         nudges = np.zeros((4, m.model.nq))
         aside = np.hypot(RESOLUTION, self.noise.max())
-        first = m.objects[::7]  # where each free joint begins in qpos
+        kinds, address = m.model.jnt_type, m.model.jnt_qposadr
+        first = address[kinds == int(mujoco.mjtJoint.mjJNT_FREE)]  # where each free joint begins in qpos
+        slides = np.intersect1d(address[kinds == int(mujoco.mjtJoint.mjJNT_SLIDE)], m.objects)
         nudges[1, first], nudges[2, first + 1] = aside, aside
+        nudges[1, slides], nudges[2, slides] = aside, -aside
         nudges[3, first + 3], nudges[3, first + 6] = np.cos(TURN / 2) - 1, np.sin(TURN / 2)
         finer = Motion(deployment, measured, w.samples, rest, finer=2)
         finer.windows = w

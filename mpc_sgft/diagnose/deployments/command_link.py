@@ -11,6 +11,7 @@ from collections.abc import Sequence
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from envs.effects.actuator_delay import ActuatorDelay
@@ -20,7 +21,9 @@ from envs.task import AbstractTask, whole_steps
 from mpc_sgft.command.errors import UserError
 from mpc_sgft.diagnose.data.held_commands import MIN_LAG
 from mpc_sgft.diagnose.data.measured import Array
-from mpc_sgft.diagnose.deployments.recordings import Rollout
+from mpc_sgft.diagnose.deployments.recordings import Rollout, joint_columns
+
+AT_LIMIT = 1e-4  # of the range of forces
 
 
 def measured_drive(model: mujoco.MjModel, episode: Rollout) -> Array:
@@ -45,6 +48,13 @@ def measured_drive(model: mujoco.MjModel, episode: Rollout) -> Array:
     return out
 
 
+def saturated(model: mujoco.MjModel, episode: Rollout) -> NDArray[np.bool_]:
+    """Where a servo gave all the force that it can, so that its control is not told by it, [S, nu]."""
+    low, high = model.actuator_forcerange.T
+    beyond = (episode.force <= low + AT_LIMIT * (high - low)) | (episode.force >= high - AT_LIMIT * (high - low))
+    return beyond & (model.actuator_forcelimited == 1)
+
+
 class ServoCommands:
     """What the interface sends to the servos for the actions of all episodes.
 
@@ -59,7 +69,9 @@ class ServoCommands:
         longest = max(len(e.action) for e in episodes)
         self.action = np.stack([_padded(e.action, longest) for e in episodes], 1)  # [T, E, A]
         self.seen = np.stack([_padded(e.observation[:-1], longest) for e in episodes], 1)  # [T, E, O]
-        self.first = np.stack([e.q[0] for e in episodes])  # [E, nj]
+        model, columns = task.spec().compile(), joint_columns(task, "qpos")
+        driven = [columns.index(int(model.jnt_qposadr[joint])) for joint in model.actuator_trnid[:, 0]]
+        self.first = np.stack([e.q[0, driven] for e in episodes])  # [E, nu]
 
     @property
     def times(self) -> Array:

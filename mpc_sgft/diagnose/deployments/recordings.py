@@ -159,8 +159,9 @@ def as_rollout(name: str, episode: Episode, task: AbstractTask) -> Rollout:
 
 
 def joint_columns(task: AbstractTask, kind: str) -> list[int]:
-    """Where the machine's hinges and slides stand in qpos or qvel; what has no motor's kind of joint is an object."""
+    """Where the machine's hinges and slides stand in qpos or qvel; what hangs together with no motor is an object."""
     model = task.spec().compile()
     address = model.jnt_qposadr if kind == "qpos" else model.jnt_dofadr
-    kinds = [int(k) for k in SCALAR]
-    return [int(address[i]) for i in range(model.njnt) if int(model.jnt_type[i]) in kinds]
+    kinds, tree = [int(k) for k in SCALAR], model.dof_treeid[model.jnt_dofadr]
+    driven = set(tree[model.actuator_trnid[:, 0]].tolist())
+    return [int(address[i]) for i in range(model.njnt) if int(model.jnt_type[i]) in kinds and int(tree[i]) in driven]

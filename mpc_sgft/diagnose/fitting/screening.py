@@ -23,6 +23,7 @@ class Effort(NamedTuple):
     Attributes:
         beam: Sets that are extended, to two effects, to three.
         full: Candidates that get a full fit: alone, as a second effect, as a third; twice as many get a quick one.
+        starts: Of each set that get a quick fit; None: those that promise most, of whichever sets they are.
         screen_windows, quick_windows: Windows for one step of each, and for quick fits.
         quick, last: Iterations of a quick fit, and of the full one that goes on from it.
         enough: Pairs are tried although no effect alone gains, if the error is above this.
@@ -33,6 +34,7 @@ class Effort(NamedTuple):
 
     beam: tuple[int, ...] = (2, 1)
     full: tuple[int, ...] = (5, 2, 2)
+    starts: int | None = None
     screen_windows: int = 6
     quick_windows: int = 10
     quick: int = 3

@@ -133,7 +133,8 @@ def promising(
     for p in (p for p in ranked if len(p.terms) == len(parent.fit.terms)):
         starts.setdefault(key_of(setup, p.terms), []).append(p)
     richer = [p for ps in starts.values() for p in ps[:STARTS]]
-    others = [p for p in ranked if len(p.terms) > len(parent.fit.terms)][: 2 * full]
+    others = [p for p in ranked if len(p.terms) > len(parent.fit.terms)]
+    others = of_each(setup, others, effort.starts, 2 * full) if effort.starts else others[: 2 * full]
     new: dict[frozenset[str], Hypothesis] = {}
     for some, count in ((richer, len(starts)), (others, full)):
         sets: dict[frozenset[str], Proposal] = {}
@@ -147,6 +148,14 @@ def promising(
             if key not in found or fitted.error < found[key].error:
                 new[key] = fitted
     return new
+
+
+def of_each(setup: Setup[Any], ranked: list[Proposal], starts: int, most: int) -> list[Proposal]:
+    """The best starts of each of the best sets."""
+    sets: dict[frozenset[str], list[Proposal]] = {}
+    for p in ranked:
+        sets.setdefault(key_of(setup, p.terms), []).append(p)
+    return [p for some in list(sets.values())[:most] for p in some[:starts]]
 
 
 def exchange(

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from hydra.utils import instantiate
 
 from envs.backends.sim import SimBackend
 from envs.effects import load
-from envs.tasks.push import Push
 from mpc_sgft.diagnose.data.measured import write_csv
 from mpc_sgft.storage.episode_file import EpisodeWriter
 
@@ -81,7 +81,7 @@ def record(tmp_path: Path) -> Callable[..., Path]:
     return write
 
 
-PUSH = Path(__file__).parents[3] / "configs" / "task" / "push.yaml"
+TASKS = Path(__file__).parents[3] / "configs" / "task"
 HELD_OUT = {
     "signal": str,
     "unit": str,
@@ -144,27 +144,31 @@ def check_report() -> Callable[[dict], None]:
 
 @pytest.fixture
 def deployed(tmp_path: Path) -> Callable[..., Path]:
-    """Drive push with its scripted policy in a gap and record it as deploy does; returns the run folder.
+    """Drive a task with its scripted policy in a gap and record it as deploy does; returns the run folder.
 
-    Its config.yaml tells a gap that was never there: who reads it is found out.
+    With `against`, the policy counters a drift that it knows. Its config.yaml tells a gap that was never there: who
+    reads it is found out.
     """
 
-    def make(effects: dict, episodes: int = 4, steps: int = 40) -> Path:
+    def make(
+        effects: dict, episodes: int = 4, steps: int = 40, task_name: str = "push", against: float | list = 0.0
+    ) -> Path:
         folder = tmp_path / "run"
         (folder / "episodes").mkdir(parents=True)
-        task_cfg = yaml.safe_load(PUSH.read_text())
-        config = {"command": "deploy", "chosen": {"task": "push", "gap": "lie"}, "task": task_cfg}
+        task_cfg = yaml.safe_load((TASKS / f"{task_name}.yaml").read_text())
+        config = {"command": "deploy", "chosen": {"task": task_name, "gap": "lie"}, "task": task_cfg}
         config["gap"] = {"effects": {"actuator_gain": {"gain": 0.1}}}
         (folder / "config.yaml").write_text(yaml.safe_dump(config))
-        task = Push(**{k: v for k, v in task_cfg["env"].items() if k != "_target_"})
+        task = instantiate(task_cfg["env"], _convert_="all")
         backend, rng = SimBackend(task, 1, effects=load(effects)), np.random.default_rng(0)
         for number in range(1, episodes + 1):
             backend.seed(number)
             seen = backend.reset(np.arange(1))
-            meta = {"task": "push", **backend.describe()}
+            meta = {"task": task_name, **backend.describe()}
             with EpisodeWriter(folder / "episodes" / f"{number:04d}.mcap", meta) as writer:
                 for t in range(steps):
-                    action = np.clip(task.scripted(seen) + 0.3 * rng.standard_normal((1, 2)), -1, 1)
+                    noise = 0.3 * rng.standard_normal((1, task.action_dim))
+                    action = np.clip(task.scripted(seen) - against + noise, -1, 1)
                     out = backend.send(action)
                     row = {"step": t, "time": (t + 1) * task.control_dt, "observation": seen[0], "action": action[0]}
                     row |= {"next_observation": out.observation[0], "action_sent": out.action_sent[0]}

@@ -9,13 +9,15 @@ import mujoco
 import numpy as np
 import pytest
 import yaml
+from hydra.utils import instantiate
 
 from envs.effects import load
+from mpc_sgft.command.compose import compose
 from mpc_sgft.command.errors import UserError
 from mpc_sgft.diagnose.__main__ import main
 from mpc_sgft.diagnose.deployed import diagnose_run
-from mpc_sgft.diagnose.deployments.command_link import ServoCommands, measured_drive
-from mpc_sgft.diagnose.deployments.recordings import read_deployment
+from mpc_sgft.diagnose.deployments.command_link import ServoCommands, measured_drive, saturated
+from mpc_sgft.diagnose.deployments.recordings import joint_columns, read_deployment
 from mpc_sgft.storage.episode_file import read_episode
 
 FEW = ["actuator_gain", "frame_rotation", "actuator_delay", "contact_friction"]
@@ -78,6 +80,37 @@ def test_a_weak_drive_shows_as_a_slope_over_the_command(deployed) -> None:
     ]
     assert np.polyfit(now[1], law.before, 1)[0] == pytest.approx(-0.3, abs=0.25)
     assert law.after is not None and np.std(law.after) < 0.05 * np.std(law.before)
+
+
+@pytest.mark.slow
+def test_a_weak_arm_is_named_although_it_hammers_with_all_its_force(deployed) -> None:
+    gap = {"actuator_gain": {"gain": 0.8}, "joint_stiffness": {"stiffness": 1000.0, "at": ["nail"]}}
+    run = deployed(gap, episodes=6, steps=50, task_name="hammer")
+    report = diagnose_run(run, effects=["actuator_gain", "deadband", "actuator_lag"]).as_dict()
+    (effect,) = report["effects"]
+    assert (report["verdict"], effect["name"]) == ("effect", "actuator_gain"), report["reason"]
+    assert effect["parameters"]["gain"]["value"] == pytest.approx(0.8, abs=0.01)
+    model = read_deployment(run).task.spec().compile()
+    spent = np.concatenate([saturated(model, e) for e in read_deployment(run).episodes])
+    assert spent[:, 1].mean() > 0.02, "its servos are at their limits when it strikes"
+
+
+@pytest.mark.slow
+def test_a_drift_of_the_hand_is_named_though_it_is_countered(deployed) -> None:
+    drift = [-0.2, 0.3, 0.0]
+    run = deployed({"actuator_offset": {"offset": drift}}, episodes=8, task_name="insert", against=drift)
+    report = diagnose_run(run, effects=["actuator_offset", "actuator_gain", "frame_rotation"], max_effects=2).as_dict()
+    (effect,) = report["effects"]
+    assert (report["verdict"], effect["name"]) == ("effect", "actuator_offset"), report["reason"]
+    found = [effect["parameters"][f"offset_{i}"]["value"] for i in (1, 2, 3)]
+    np.testing.assert_allclose(found, drift, atol=0.01)
+
+
+def test_only_what_hangs_on_a_motor_is_the_machine() -> None:
+    for task, own in (("hammer", 7), ("insert", 7), ("push_towel", 7), ("walker_walk", 9)):
+        cfg = compose("deploy", [f"task={task}"], [])
+        made = instantiate(cfg.task.env, _convert_="all")
+        assert len(joint_columns(made, "qpos")) == len(joint_columns(made, "qvel")) == own, task
 
 
 def test_a_right_simulator_has_no_effect(deployed, check_report) -> None:

@@ -16,8 +16,8 @@ from mpc_sgft.diagnose.fitting import search as searching
 from mpc_sgft.diagnose.fitting.fit import Fit, fit
 from mpc_sgft.diagnose.fitting.hypothesis import Hypothesis, holds, judge_fit
 from mpc_sgft.diagnose.fitting.prepare import NOISE, Setup
-from mpc_sgft.diagnose.fitting.screening import Effort
-from mpc_sgft.diagnose.fitting.search import no_worse, search, swaps
+from mpc_sgft.diagnose.fitting.screening import Effort, Proposal
+from mpc_sgft.diagnose.fitting.search import no_worse, of_each, search, swaps
 from mpc_sgft.diagnose.simulation.plant import Change, Plant
 from mpc_sgft.diagnose.verdict.verdict import reach_verdict
 from tests.mpc_sgft.diagnose.lines import Lines, Points, motion, term
@@ -52,6 +52,16 @@ def test_of_many_effects_the_right_ones_are_found_with_fewer_simulations() -> No
         spent[most] = problem.simulated
         assert set(min(hypotheses, key=lambda e: e.error).names) == {"e7", "e23", "e41"}
     assert spent[8] < 0.7 * spent[60], spent
+
+
+def test_a_set_gets_no_more_quick_fits_than_starts_however_well_it_promises() -> None:
+    problem, fitted, none = Lines(), np.arange(18), np.zeros(1)
+    base = fit(problem, [], [], fitted)
+    setup = Setup(problem, fitted, np.arange(18, 24), fitted // 3, base, none, none, np.log1p, NOISE)
+    a, b, c = (term(name) for name in "abc")
+    ranked = [Proposal((t,), (np.array([x]),), 0.0) for t, x in ((a, 1.0), (a, 2.0), (a, 3.0), (b, 4.0), (c, 5.0))]
+    kept = of_each(setup, ranked, starts=2, most=2)
+    assert [float(p.start[0][0]) for p in kept] == [1.0, 2.0, 4.0]
 
 
 def found(pairs: int) -> list[set[str]]:
