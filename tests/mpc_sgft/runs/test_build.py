@@ -15,7 +15,7 @@ def test_a_variant_of_a_task_takes_its_agents_and_another_task_does_not() -> Non
     _, meta = build.load_agent(cfg)
     assert meta["task"] == "push"
     with pytest.raises(
-        UserError, match=r"no checkpoint is shipped for task 'pendulum' \(shipped: hammer, insert, push\)"
+        UserError, match=r"no checkpoint is shipped for task 'pendulum' \(shipped: hammer, insert, push, rope_peg_in_hole\)"
     ):
         build.load_agent(compose.compose("evaluate", ["task=pendulum"], []))
     for soft in ("push_towel", "push_ball"):
@@ -27,7 +27,7 @@ def test_a_variant_of_a_task_takes_its_agents_and_another_task_does_not() -> Non
         build.load_agent(cfg)
 
 
-@pytest.mark.parametrize("task", ["hammer", "insert"])
+@pytest.mark.parametrize("task", ["hammer", "insert", "rope_peg_in_hole"])
 def test_a_shipped_agent_does_its_task_and_knows_the_range_of_its_values(task: str) -> None:
     cfg = compose.compose("evaluate", [f"task={task}"], [])
     agent, meta = build.load_agent(cfg)
