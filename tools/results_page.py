@@ -14,7 +14,7 @@ from statistics import median
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "results"
-TASKS = ("hammer", "insert", "push_towel", "push_ball")
+TASKS = ("hammer", "insert", "push_towel", "push_ball", "rope_peg_in_hole")
 BEGIN, END = "<!-- headline:begin -->", "<!-- headline:end -->"
 Row = dict[str, str]
 
@@ -85,9 +85,12 @@ def digits(value: str) -> str:
     return f"{float(value):.4g}"
 
 
+NAMED = {"gap": "gap", "seed": "seed", "effect": "effect", "parameter": "parameter", "value": ("value", digits)}
+
+
 def transfer() -> str:
     rows = read("transfer/sgft.csv") + read("transfer/tdmpc2.csv")
-    return curves(rows, lambda r: f"`{r['gap']}`, {r['method']}", "gap and method")
+    return curves(rows, method_in_gap, "gap and method")
 
 
 def tasks() -> str:
@@ -98,9 +101,15 @@ def tasks() -> str:
         "planner's success": ("success", percent),
         "episodes": "episodes",
     }
-    rows = [row for name in TASKS for row in read(f"tasks/{name}.csv")]
-    simulated = pick(read("tasks/pretrained.csv"), head)
-    return f"{simulated}\n\n" + curves(rows, lambda r: f"`{r['gap']}`, {r['method']}", "gap and method")
+    files = [f"tasks/{name}{method}.csv" for name in TASKS for method in ("", "_tdmpc2")]
+    rows = [row for file in files if (RESULTS / file).exists() for row in read(file)]
+    parts = [pick(read("tasks/pretrained.csv"), head), curves(rows, method_in_gap, "gap and method")]
+    parts.append(f"What `diagnose --run` names in these realities:\n\n{pick(read('tasks/diagnose_run.csv'), NAMED)}")
+    return "\n\n".join(parts)
+
+
+def method_in_gap(row: Row) -> str:
+    return f"`{row['gap']}`, {row['method']}"
 
 
 def audit() -> str:
@@ -173,10 +182,9 @@ def loop() -> str:
     }
     head |= {"30 rollouts": ("final_before", percent), "after ": ("final_after", percent)}
     head |= {"rollouts to 95 %": "rollouts_to_95_before", "after  ": "rollouts_to_95_after"}
-    named = {"gap": "gap", "seed": "seed", "effect": "effect", "parameter": "parameter", "value": ("value", digits)}
     parts = [pick(read("close_the_loop/close_the_loop.csv"), head)]
     for file, says in (("diagnose_run", "What was named"), ("diagnose_run_again", "With the later solver")):
-        parts.append(f"{says}:\n\n{pick(read(f'close_the_loop/{file}.csv'), named)}")
+        parts.append(f"{says}:\n\n{pick(read(f'close_the_loop/{file}.csv'), NAMED)}")
     return "\n\n".join(parts)
 
 
@@ -267,7 +275,7 @@ def exact() -> str:
 STUDIES: dict[str, Callable[[], str]] = {
     "pretrain": pretrain,
     "transfer": transfer,
-    "outside": lambda: curves(read("outside/sgft.csv"), lambda r: f"`{r['gap']}`, {r['method']}", "gap and method"),
+    "outside": lambda: curves(read("outside/sgft.csv"), method_in_gap, "gap and method"),
     "tasks": tasks,
     "audit": audit,
     "ablation": lambda: curves(read("ablation/ablation.csv"), left_out, "gap, and what is left out"),
@@ -323,7 +331,7 @@ def headline() -> str:
         shown = [counts[0], counts[len(counts) // 2], counts[-1]]
         after = [[float(r["success"]) for r in runs if int(r["rollouts"]) == n] for n in shown]
         text = " → ".join(spread(values).replace(" %", "") for values in after) + " %"
-        rows.append([f"`{task}_real`, {' → '.join(map(str, shown))}", text, "tasks"])
+        rows.append([f"`{runs[0]['gap']}`, {' → '.join(map(str, shown))}", text, "tasks"])
     score = {r["score"]: r for r in read("blind/blind.csv") if r["method"] == "diagnose"}
     top, false = score["single, clear: top 1"], score["no effect: false alarms"]
     rows.append(["diagnose, right name", f"{percent(top['value'])} of {top['of']}", "blind"])
