@@ -14,7 +14,7 @@ def test_a_variant_of_a_task_takes_its_agents_and_another_task_does_not() -> Non
     assert compose.compose("pretrain", ["task=push_edge"], []).randomize.draws
     _, meta = build.load_agent(cfg)
     assert meta["task"] == "push"
-    have = r"\(shipped: hammer, insert, push, rope_peg_in_hole\)"
+    have = r"\(shipped: hammer, insert, push, rope_peg_in_hole, walker_walk\)"
     with pytest.raises(UserError, match=f"no checkpoint is shipped for task 'pendulum' {have}"):
         build.load_agent(compose.compose("evaluate", ["task=pendulum"], []))
     for soft in ("push_towel", "push_ball"):
