@@ -27,6 +27,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from envs.env import ControlEnv
 from envs.task import AbstractTask
+from envs.tasks.push import Push
 from mpc_sgft.command import compose
 from mpc_sgft.runs import build
 from mpc_sgft.runs.collect import Act, collect, planner_policy, score, scripted_policy
@@ -143,8 +144,10 @@ def save_gif(path: Path, pictures: list[Image.Image], seconds: float) -> None:
     flat[0].save(path, save_all=True, append_images=flat[1:], duration=durations, loop=0, optimize=True)
 
 
-def table_camera() -> mujoco.MjvCamera:
-    """Over the table of push, nearer than the viewer's."""
+def near_camera(task: AbstractTask) -> mujoco.MjvCamera:
+    """Over the table of push, nearer than the viewer's; the viewer's for other tasks."""
+    if not isinstance(task, Push):
+        return camera_of(task)
     camera = mujoco.MjvCamera()
     camera.lookat, camera.distance, camera.azimuth, camera.elevation = [0.47, 0.0, 0.04], 1.64, 122, -30
     return camera
@@ -179,7 +182,7 @@ def film(run: Path, out: Path) -> list[Episode]:
         model, planner = build.load_agent(settings)[0].model.eval(), build.make_planner(cfg, env.action_dim)
         seen.append(episode(env, planner_policy(model, planner, EVAL_SEED), EVAL_SEED, env.task.episode_steps))
         numbers = f"success in {summary['evaluation_episodes']} episodes: {curve[str(rollouts)]:.0%}"
-        panels.append(Panel(draw(env.task, seen[-1].qpos, table_camera()), title, numbers, seen[-1].success))
+        panels.append(Panel(draw(env.task, seen[-1].qpos, near_camera(env.task)), title, numbers, seen[-1].success))
     save_gif(out, frames(panels), env.task.episode_steps * env.task.control_dt)
     return seen
 

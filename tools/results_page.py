@@ -104,6 +104,10 @@ def tasks() -> str:
     files = [f"tasks/{name}{method}.csv" for name in TASKS for method in ("", "_tdmpc2")]
     rows = [row for file in files if (RESULTS / file).exists() for row in read(file)]
     parts = [pick(read("tasks/pretrained.csv"), head), curves(rows, method_in_gap, "gap and method")]
+    walked: dict[str, str | tuple[str, Callable[[str], str]]]
+    walked = {"gap": "gap", "method": "method", "seed": "seed", "rollouts": "rollouts"}
+    walked |= {"return": ("return", digits), "success": ("success", percent)}
+    parts.append(f"Return, of at most 200:\n\n{pick(read('tasks/walker_walk.csv'), walked)}")
     parts.append(f"What `diagnose --run` names in these realities:\n\n{pick(read('tasks/diagnose_run.csv'), NAMED)}")
     return "\n\n".join(parts)
 

@@ -73,13 +73,13 @@ DRAW = """
 import numpy as np
 from mpc_sgft.command import compose
 from mpc_sgft.runs import build
-from tools.film import PANEL, draw, table_camera
+from tools.film import PANEL, draw, near_camera
 env = build.make_env(compose.compose("deploy", [], []), 1)
 env.set_seed(0)
 env.reset()
 moved = env.backend.qpos[:1].copy()
 moved[0, 7] += 0.3
-here, there = draw(env.task, np.concatenate([env.backend.qpos[:1], moved]), table_camera()).astype(int)
+here, there = draw(env.task, np.concatenate([env.backend.qpos[:1], moved]), near_camera(env.task)).astype(int)
 assert here.shape == (PANEL[1], PANEL[0], 3)
 red, green, blue = np.moveaxis(here, 2, 0)
 puck, line = (red > green + 60) & (red > blue + 60), (green > red + 40) & (green > blue + 30)
