@@ -13,7 +13,7 @@ class RopeLength(Effect):
     """Multiply the greatest length of tendons by `scale` (`tendon_range`).
 
     Raises:
-        ValueError: From `edit_spec`, for a tendon without a greatest length.
+        ValueError: From `edit_spec`, for a tendon without a greatest length, or where there is no tendon to change.
     """
 
     scale: float = 1.0
@@ -23,6 +23,8 @@ class RopeLength(Effect):
     bounds: ClassVar[dict[str, tuple[float, float]]] = {"scale": (0.1, 10.0)}
 
     def edit_spec(self, spec: mujoco.MjSpec) -> None:
+        if self.scale != 1 and not spec.tendons:
+            raise ValueError(f"rope_length.scale={self.scale}: this scene has no tendons")
         for tendon in pick(spec.tendons, self.at, "tendon"):
             shortest, longest = tendon.range
             if shortest >= longest:

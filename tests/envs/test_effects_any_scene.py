@@ -206,7 +206,7 @@ def test_a_gap_adds_nothing_to_what_a_task_records(make_backend, name) -> None:
 
 def test_places_and_natives_are_told() -> None:
     places = {name: _kind(name).place for name in available()}
-    assert set(places.values()) == {"", "joint", "actuator", "body", "geom", "signal"}
+    assert set(places.values()) == {"", "joint", "actuator", "body", "geom", "tendon", "signal"}
     hooks = ("command", "ctrl", "force", "friction", "sense")
     for name in available():
         acts = [h for h in hooks if getattr(_kind(name), h) is not getattr(Effect, h)]

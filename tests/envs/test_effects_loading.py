@@ -104,6 +104,7 @@ def test_values_out_of_bounds_are_refused(effect, message) -> None:
         ("push", {"load_dependent_friction": {"at": ["elbow"]}}, "No joint 'elbow' in this scene. Available: joint1"),
         ("push", {"sensor_gain": {"gain": [1, 1]}}, "sensor_gain.gain=.*2 numbers; give one, or 4"),
         ("push", {"torque_saturation": {"at": ["motor"]}}, "No actuator 'motor' in this scene"),
+        ("push", {"rope_length": {"scale": 2.0}}, "rope_length.scale=2.0: this scene has no tendons"),
         ("rope_peg_in_hole", {"rope_length": {"at": ["rope9"]}}, "No tendon 'rope9' in this scene. Available: rope0"),
         ("push", {"actuator_gain": {"gain": [1, 1, 1]}}, "actuator_gain.gain=.*3 numbers; give one, or 2"),
         ("push", {"actuator_offset": {"offset": [0, 0, 0]}}, "actuator_offset.offset=.*3 numbers; give one, or 2"),
