@@ -8,7 +8,7 @@
 import argparse
 import csv
 import json
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from statistics import median
 
@@ -53,7 +53,7 @@ def curves(rows: list[Row], key: Callable[[Row], str], name: str) -> str:
     return table([name, "seeds", *(f"{n} rollouts" for n in counts)], lines)
 
 
-def pick(rows: list[Row], columns: dict[str, str | tuple[str, Callable[[str], str]]]) -> str:
+def pick(rows: list[Row], columns: Mapping[str, str | tuple[str, Callable[[str], str]]]) -> str:
     """Some columns of a CSV as they are, {heading: column or (column, how to write it)}."""
     how = {head: what if isinstance(what, tuple) else (what, str) for head, what in columns.items()}
     return table(list(how), [[write(row[name]) if row[name] else "" for name, write in how.values()] for row in rows])
@@ -108,7 +108,8 @@ def tasks() -> str:
     walked = {"gap": "gap", "method": "method", "seed": "seed", "rollouts": "rollouts"}
     walked |= {"return": ("return", digits), "success": ("success", percent)}
     parts.append(f"Return, of at most 200:\n\n{pick(read('tasks/walker_walk.csv'), walked)}")
-    parts.append(f"What `diagnose --run` names in these realities:\n\n{pick(read('tasks/diagnose_run.csv'), NAMED)}")
+    named = pick(read("tasks/diagnose_run.csv"), {**NAMED, "verdict": "verdict"})
+    parts.append(f"What `diagnose --run` names in these realities:\n\n{named}")
     return "\n\n".join(parts)
 
 
