@@ -99,6 +99,7 @@ def tasks() -> str:
         "transitions": "transitions",
         "minutes": "minutes",
         "planner's success": ("success", percent),
+        "return": "return",
         "episodes": "episodes",
     }
     files = [f"tasks/{name}{method}.csv" for name in TASKS for method in ("", "_tdmpc2")]

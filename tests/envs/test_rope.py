@@ -42,7 +42,7 @@ def test_the_real_one_can_be_done(make_backend, gap) -> None:
     effects = yaml.safe_load((CONFIGS / f"gap/{gap}.yaml").read_text())["effects"]
     backend = make_backend("rope_peg_in_hole", 32, effects_=effects)
     _, seen = first_and_last(backend, backend.task.scripted)
-    assert backend.task.success(seen).mean() >= 0.7
+    assert backend.task.success(seen).mean() >= 0.95
 
 
 @pytest.mark.parametrize("scale", [1.0, 2.0])
@@ -70,8 +70,8 @@ def test_it_swings_like_a_pendulum_of_its_length(make_backend) -> None:
         aside.append(qpos[:, 8 + 3 * BEADS])
     swing = np.concatenate(aside) - np.mean(np.concatenate(aside))
     crossings = np.flatnonzero(np.diff(np.sign(swing)))
-    times = len(swing) / (15 * 0.2)  # samples a second
-    period = 2 * np.diff(crossings).mean() / times
+    rate = len(swing) / (15 * 0.2)  # samples a second
+    period = 2 * np.diff(crossings).mean() / rate
     assert period == pytest.approx(2 * np.pi * np.sqrt((0.12 + 0.02) / 9.81), rel=0.05)
 
 

@@ -77,8 +77,10 @@ class Chain:
         told = [at_times(self.episodes[i].time, measured[i], t) for i, t in zip(w.episode, self.times, strict=True)]
         self.drive = changes_since_start(np.stack(told))
         spent = [saturated(model, e).astype(float) for e in self.episodes]
-        spent = [at_times(self.episodes[i].time, spent[i], t) for i, t in zip(w.episode, self.times, strict=True)]
-        self.untold = np.stack(spent)[:, 1:] + np.stack(spent)[:, :1] > 0  # of `drive`, by a servo at its limit
+        at_limit = np.stack(
+            [at_times(self.episodes[i].time, spent[i], t) for i, t in zip(w.episode, self.times, strict=True)]
+        )
+        self.untold = at_limit[:, 1:] + at_limit[:, :1] > 0  # of `drive`, by a servo that gave all it can
         self.observed = np.stack([self.episodes[i].observation[s + 1 : s + 1 + length] for i, s in pairs])
         self._cache: dict[tuple[object, ...], tuple[Array, ...]] = {}
         self._scales(deployment, measured, rest)

@@ -26,7 +26,7 @@ def test_a_variant_of_a_task_takes_its_agents_and_another_task_does_not() -> Non
         build.load_agent(cfg)
 
 
-@pytest.mark.parametrize("task", ["hammer", "insert", "rope_peg_in_hole"])
+@pytest.mark.parametrize("task", ["hammer", "insert", "rope_peg_in_hole", "walker_walk"])
 def test_a_shipped_agent_does_its_task_and_knows_the_range_of_its_values(task: str) -> None:
     cfg = compose.compose("evaluate", [f"task={task}"], [])
     agent, meta = build.load_agent(cfg)
