@@ -6,17 +6,15 @@ from numpy.typing import NDArray
 
 from envs import fr3, kinematics
 from envs.fixture import add_table_with_hole
-from envs.task import AbstractTask, Array, Start, ValuePlane, View, whole_steps
+from envs.task import Array, Start, ValuePlane, View, whole_steps
+from envs.tasks.over_table import NSAMPLE, TOP, OverTable
 
 BELOW = 0.08  # [m] from the hand to the leg's end
-REST = np.array([0.0, -0.1, 0.0, -2.3, 0.0, 2.2, 0.785])  # [rad]
-TOP = 0.10  # [m] height of the table above the robot's base
 START = 0.10  # [m] of the leg's end above the table, at the start
 LOW, HIGH = np.array([0.35, -0.15, TOP - 0.05]), np.array([0.65, 0.15, TOP + 0.2])  # [m] where the leg's end may go
-NSAMPLE = 500  # physics steps of command history that the model holds, so that a delay is a parameter
 
 
-class Insert(AbstractTask):
+class Insert(OverTable):
     """Lower the leg into the hole until its end is `depth` below the table.
 
     Observation: place of the hand, of the leg's end, and where that has to be, x, y, z each [m], in the frame of the
@@ -32,8 +30,7 @@ class Insert(AbstractTask):
 
     name = "insert"
     observation_names = tuple(f"{what}_{axis}" for what in ("hand", "leg", "hole") for axis in "xyz")
-    action_dim = 3
-    moves_in_plane = True
+    tool_length, above, low, high = fr3.TCP + BELOW, START, LOW, HIGH
 
     def __init__(
         self,
@@ -58,13 +55,9 @@ class Insert(AbstractTask):
         self.hole_x, self.hole_y, self.hole_yaw = hole_x, hole_y, hole_yaw
         self.leg_radius, self.clearance, self.depth = leg_radius, clearance, depth
         self.friction, self.tolerance, self.start_noise = friction, tolerance, start_noise
-        self._home: Array | None = None
 
     def spec(self) -> mujoco.MjSpec:
-        spec = fr3.arm_scene(self.sim_dt)
-        spec.worldbody.add_light(pos=[0.3, -0.6, 1.6], dir=[0, 0.35, -1], type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
-        spec.worldbody.add_camera(name="side", pos=[1.25, -0.95, 0.55], xyaxes=[0.776, 0.63, 0, -0.176, 0.217, 0.959])
-        hand = fr3.add_fr3(spec, base=(0, 0, 0), tool_length=fr3.TCP, tool_radius=0.02)
+        spec, hand = self.scene()
         leg = hand.add_body(name="leg", pos=[0, 0, fr3.FLANGE + fr3.TCP], gravcomp=1)
         leg.add_geom(
             name="leg",
@@ -82,31 +75,10 @@ class Insert(AbstractTask):
         add_table_with_hole(spec, radius=self.leg_radius * self.clearance, floor=TOP - self.depth, top=TOP)
         return spec
 
-    def home(self) -> Array:
-        """Joint angles [1, 7] with the leg above the middle of the table; computed once."""
-        if self._home is None:
-            middle = np.array([[np.mean(self.hole_x), np.mean(self.hole_y), TOP + START]], float)
-            q = REST[None]
-            for _ in range(30):
-                q = self._joints(q, middle)
-            self._home = q
-        return self._home
-
     def start(self, rng: np.random.Generator) -> Start:
-        place = np.array([[np.mean(self.hole_x), np.mean(self.hole_y), TOP + START]], float)
-        place = place + rng.uniform(-self.start_noise, self.start_noise, (1, 3))
-        q = self._joints(self.home(), place)
+        place, q = self.first(rng)
         hole = [rng.uniform(*self.hole_x), rng.uniform(*self.hole_y), rng.uniform(*self.hole_yaw)]
         return Start(qpos=np.concatenate([q[0], hole])[None], qvel=np.zeros((1, 10)), target=place)
-
-    def move(self, target: Array, action: Array) -> Array:
-        return np.clip(target + self.step_size * action, LOW, HIGH)
-
-    def ctrl(self, target: Array, previous_ctrl: Array) -> Array:
-        return self._joints(previous_ctrl, target)
-
-    def hold(self, qpos: Array) -> Array:
-        return kinematics.tip_position(qpos[:, :7], fr3.TCP + BELOW)
 
     def place(self, observation: Array, qpos: Array) -> Array:
         """The table where its hole is seen; its turn is not observed and left as it is."""
@@ -161,7 +133,3 @@ class Insert(AbstractTask):
         observation = np.concatenate([leg + [0, 0, BELOW], leg, hole], 1)
         extent = (LOW[0], HIGH[0], LOW[2], HIGH[2])
         return ValuePlane(observation, (points, points), extent, (("x", "m"), ("z", "m")), {"hole": (middle[0], TOP)})
-
-    def _joints(self, q: Array, place: Array) -> Array:
-        """Joint angles [N, 7] that bring the leg's end to a place [N, 3] m, the leg upright."""
-        return kinematics.inverse(q, place, REST, fr3.TCP + BELOW, upright=0.2)

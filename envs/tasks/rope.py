@@ -6,20 +6,18 @@ from numpy.typing import NDArray
 
 from envs import fr3, kinematics
 from envs.fixture import add_table_with_hole
-from envs.task import AbstractTask, Array, Start, ValuePlane, View, whole_steps
+from envs.task import Array, Start, ValuePlane, View, whole_steps
+from envs.tasks.over_table import NSAMPLE, TOP, OverTable
 
 BEADS = 4  # point masses along the rope
 BEAD_MASS = 0.005  # [kg]
 STIFF = [0.9999, 0.9999]  # impedances of a taut string: with MuJoCo's own, light beads let it stretch by a sixth
-REST = np.array([0.0, -0.1, 0.0, -2.3, 0.0, 2.2, 0.785])  # [rad]
-TOP = 0.10  # [m] height of the table above the robot's base
 START = 0.34  # [m] of the hand above the table, at the start; twice the rope fits below
 LOW, HIGH = np.array([0.35, -0.15, TOP + 0.03]), np.array([0.65, 0.15, TOP + 0.45])  # [m] where the hand may go
 CLEAR = 0.02  # [m] that the scripted policy keeps the peg above the table until it is over the hole
-NSAMPLE = 500  # physics steps of command history that the model holds, so that a delay is a parameter
 
 
-class RopePegInHole(AbstractTask):
+class RopePegInHole(OverTable):
     """Lower the peg until its middle is `depth` below the table.
 
     The rope is a chain of point masses, each tied to the next by a string that can be slack and not stretched: the peg
@@ -39,8 +37,7 @@ class RopePegInHole(AbstractTask):
 
     name = "rope_peg_in_hole"
     observation_names = tuple(f"{what}_{axis}" for what in ("hand", "peg", "hole") for axis in "xyz")
-    action_dim = 3
-    moves_in_plane = True
+    tool_length, above, low, high = fr3.TCP, START, LOW, HIGH
 
     def __init__(
         self,
@@ -68,13 +65,9 @@ class RopePegInHole(AbstractTask):
         self.peg_radius, self.peg_half_height, self.peg_mass = peg_radius, peg_half_height, peg_mass
         self.hole_radius, self.depth = hole_radius, depth
         self.goal_z = TOP - depth
-        self._home: Array | None = None
 
     def spec(self) -> mujoco.MjSpec:
-        spec = fr3.arm_scene(self.sim_dt)
-        spec.worldbody.add_light(pos=[0.3, -0.6, 1.6], dir=[0, 0.35, -1], type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
-        spec.worldbody.add_camera(name="side", pos=[1.25, -0.95, 0.55], xyaxes=[0.776, 0.63, 0, -0.176, 0.217, 0.959])
-        fr3.add_fr3(spec, base=(0, 0, 0), tool_length=fr3.TCP, tool_radius=0.02)
+        spec, _ = self.scene()
         for i in range(BEADS):
             bead = spec.worldbody.add_body(name=f"bead{i}")
             for axis, direction in zip("xyz", np.eye(3), strict=True):
@@ -117,20 +110,8 @@ class RopePegInHole(AbstractTask):
             conaffinity=0,
         )
 
-    def home(self) -> Array:
-        """Joint angles [1, 7] with the hand above the middle of the table; computed once."""
-        if self._home is None:
-            middle = np.array([[np.mean(self.hole_x), np.mean(self.hole_y), TOP + START]], float)
-            q = REST[None]
-            for _ in range(30):
-                q = self._joints(q, middle)
-            self._home = q
-        return self._home
-
     def start(self, rng: np.random.Generator) -> Start:
-        place = np.array([[np.mean(self.hole_x), np.mean(self.hole_y), TOP + START]], float)
-        place = place + rng.uniform(-self.start_noise, self.start_noise, (1, 3))
-        q = self._joints(self.home(), place)
+        place, q = self.first(rng)
         hand = kinematics.tip_position(q, fr3.TCP)[0]
         down = np.array([0.0, 0.0, -1.0])
         beads = [hand + down * self.rope_length * (i + 1) / (BEADS + 1) for i in range(BEADS)]
@@ -138,15 +119,6 @@ class RopePegInHole(AbstractTask):
         hole = [rng.uniform(*self.hole_x), rng.uniform(*self.hole_y), 0.0]
         qpos = np.concatenate([q[0], *beads, peg, [1.0, 0.0, 0.0, 0.0], hole])
         return Start(qpos=qpos[None], qvel=np.zeros((1, len(qpos) - 1)), target=place)
-
-    def move(self, target: Array, action: Array) -> Array:
-        return np.clip(target + self.step_size * action, LOW, HIGH)
-
-    def ctrl(self, target: Array, previous_ctrl: Array) -> Array:
-        return self._joints(previous_ctrl, target)
-
-    def hold(self, qpos: Array) -> Array:
-        return kinematics.tip_position(qpos[:, :7], fr3.TCP)
 
     def place(self, observation: Array, qpos: Array) -> Array:
         """The table where its hole is seen and the peg where it is seen, upright; the rope is left as it is."""
@@ -207,7 +179,3 @@ class RopePegInHole(AbstractTask):
         observation = np.concatenate([peg + [0, 0, self.rope_length + self.peg_half_height], peg, hole], 1)
         extent = (LOW[0], HIGH[0], low, high)
         return ValuePlane(observation, (points, points), extent, (("x", "m"), ("z", "m")), {"hole": (middle[0], TOP)})
-
-    def _joints(self, q: Array, place: Array) -> Array:
-        """Joint angles [N, 7] that bring the hand to a place [N, 3] m, upright."""
-        return kinematics.inverse(q, place, REST, fr3.TCP, upright=0.2)
