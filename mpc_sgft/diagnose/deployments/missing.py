@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from typing import TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mpc_sgft.diagnose.data.measured import Array
 from mpc_sgft.diagnose.deployments.chain import Chain, Prediction
 from mpc_sgft.diagnose.deployments.motion_link import JOINT_SAMPLES
 from mpc_sgft.diagnose.page.laws import Law, Laws
 
+T = TypeVar("T", bound=np.generic)
 DRIVES, OBSERVATIONS = 3, 4  # that are drawn, at most
 READING = (
     "Of a drive, what reached it in a control step beyond what was commanded: a wrong gain shows as a slope over the "
@@ -28,18 +30,26 @@ def missing(chain: Chain, both: Prediction, repaired: bool) -> Laws:
         repaired: Whether the second is another model.
     """
     told = _steps(both.drive[0])  # [W, n, nu]
-    drive = [_flat(_steps(chain.drive) - _steps(y)) for y in both.drive]
+    untold = chain.untold[:, JOINT_SAMPLES - 1 :: JOINT_SAMPLES]  # a step from or to a limit misses what others missed
+    told_of = ~(_flat(untold) | _flat(untold, -1))
+    drive = [_flat(_steps(chain.drive) - _steps(y)) * told_of for y in both.drive]
     along = [("commanded change", _flat(told)), ("commanded change, a step before", _flat(told, -1))]
     first = [chain.episodes[i].observation[s] for i, s in zip(chain.windows.episode, chain.windows.start, strict=True)]
     gone = [(chain.observed - y)[:, -1] for y in both.observation]
     went = [("change in the window", chain.observed[:, -1] - np.stack(first))]
     kinds = (
-        ("drive", drive, along, chain.drive_scale, DRIVES),
-        ("observation", gone, went, chain.observation_scale[:, -1], OBSERVATIONS),
+        ("drive", drive, along, told_of, chain.drive_scale, DRIVES),
+        ("observation", gone, went, np.ones(gone[0].shape, bool), chain.observation_scale[:, -1], OBSERVATIONS),
     )
     laws = [
-        Law(chain.groups[kind][i], "missing change", [(n, x[:, i]) for n, x in axes], *_sides(lacking, i, repaired))
-        for kind, lacking, axes, scale, most in kinds
+        Law(
+            chain.groups[kind][i],
+            "missing change",
+            [(name, x[known[:, i], i]) for name, x in axes],
+            lacking[0][known[:, i], i],
+            lacking[1][known[:, i], i] if repaired else None,
+        )
+        for kind, lacking, axes, known, scale, most in kinds
         for i in _worst(lacking[0], scale)[:most]
     ]
     return Laws("What is missing", READING, laws)
@@ -50,7 +60,7 @@ def _steps(u: Array) -> Array:
     return np.diff(u[:, JOINT_SAMPLES - 1 :: JOINT_SAMPLES], axis=1, prepend=0.0)
 
 
-def _flat(steps: Array, shift: int = 0) -> Array:
+def _flat(steps: NDArray[T], shift: int = 0) -> NDArray[T]:
     """All steps but each window's first [W, n, nu] -> [W (n - 1), nu]; of the steps before with a shift of -1."""
     return steps[:, 1 + shift : steps.shape[1] + shift].reshape(-1, steps.shape[-1])
 
@@ -61,7 +71,3 @@ def _worst(lacking: Array, scale: Array | float) -> list[int]:
         return []
     error = ((lacking / scale) ** 2).mean(0)
     return [int(i) for i in np.argsort(-error) if error[i] > 1]
-
-
-def _sides(lacking: Sequence[Array], i: int, repaired: bool) -> tuple[Array, Array | None]:
-    return lacking[0][:, i], lacking[1][:, i] if repaired else None
