@@ -43,6 +43,12 @@ class Dynamics(nn.Module):
         window = (lag[:, None] + torch.arange(longest, device=commands.device)).clamp(max=len(lag) - 1)
         return self.command(each[..., window, :].flatten(-2)).flatten(-2)
 
+    def command_change(self) -> Tensor:
+        """Sum of the absolute differences of the command map from the identity, scalar."""
+        assert self.command is not None, "there is no command map"
+        weight, bias = self.command.weight, self.command.bias
+        return (weight - torch.eye(*weight.shape, device=weight.device)).abs().sum() + bias.abs().sum()
+
     def as_simulated(self, z: Tensor) -> Tensor:
         """The latent with its commands as the machine realised them: what the simulator would have called them."""
         if self.command is None or not self.memory_dim:

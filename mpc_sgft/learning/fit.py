@@ -30,12 +30,12 @@ class Maps(NamedTuple):
     Attributes:
         parts: What learns.
         simulated: The simulator's dynamics, with the command map of those that train.
-        penalty: On the maps.
+        penalties: On the maps.
     """
 
     parts: tuple[nn.Module, ...]
     simulated: Dynamics
-    penalty: Penalty | None = None
+    penalties: tuple[Penalty, ...] = ()
 
 
 @in_own_precision
@@ -71,17 +71,17 @@ def fit_dynamics(
         zs = losses.imagine(dynamics, encoded[0], data.action)
         return losses.over_time((zs[1:] - encoded[1:]).square().mean(-1), rho, weight)
 
-    def with_penalty(loss: Tensor, penalty: Penalty | None) -> Tensor:
-        if penalty is None:
-            return loss
-        metrics[penalty.name] = penalty.value()
-        return loss + penalty.weight * metrics[penalty.name]
+    def with_penalties(loss: Tensor, penalties: tuple[Penalty, ...]) -> Tensor:
+        for penalty in penalties:
+            metrics[penalty.name] = penalty.value()
+            loss = loss + penalty.weight * metrics[penalty.name]
+        return loss
 
     metrics = {"consistency_loss": error(agent.model.dynamics, encoded)}
-    total = with_penalty(metrics["consistency_loss"], penalty)
+    total = with_penalties(metrics["consistency_loss"], (penalty,) if penalty else ())
     if maps is not None:
         metrics["map_loss"] = error(maps.simulated, seen)
-        of_maps = with_penalty(metrics["map_loss"], maps.penalty)
+        of_maps = with_penalties(metrics["map_loss"], maps.penalties)
     check_finite(metrics)
     agent.model_optimizer.zero_grad()
     scale = agent.weights["consistency_loss"]

@@ -39,6 +39,8 @@ class SGFT(AbstractMethod):
             from the identity.
         residual: Train a correction that starts at zero on top of frozen pretrained dynamics.
         command_map: Also learn what the machine makes of a command, a few numbers that hold everywhere.
+        command_sparsity: Weight of the sum of their absolute differences from the identity, divided by the rollouts so
+            far: what is wrong with a machine is mostly one thing (the lasso: Tibshirani, JRSS B 1996).
         observation_map: Also learn what the sensors should have said: a turn of what a camera sees, a shift of each
             entry, once rollouts start where none does in simulation. Found like the command map, by what the
             simulator's dynamics can explain, and by where rollouts start.
@@ -64,6 +66,7 @@ class SGFT(AbstractMethod):
         anchor: float,
         residual: bool,
         command_map: bool,
+        command_sparsity: float,
         observation_map: bool,
         observation_lr: float,
         start_weight: float,
@@ -83,7 +86,7 @@ class SGFT(AbstractMethod):
             raise ValueError(f"rho={rho} must lie in (0, 1].")
         self.horizon, self.lr, self.policy_lr, self.command_lr = horizon, lr, policy_lr, command_lr
         self.entropy_coef, self.rho, self.anchor = entropy_coef, rho, anchor
-        self.residual, self.command_map = residual, command_map
+        self.residual, self.command_map, self.command_sparsity = residual, command_map, command_sparsity
         self.gate = Gate(gate_margin, gate_memory) if gate else None
         self.updates, self.slice_len, self.action_noise = updates, slice_len, action_noise
         self.observation_map, self.observation_lr, self.start_weight = observation_map, observation_lr, start_weight
@@ -145,8 +148,12 @@ class SGFT(AbstractMethod):
         commands = self._simulated.command if self.command_map else None
         sensors = model.observation_map if self.observation_map else None
         parts = tuple(part for part in (commands, sensors) if part is not None)
+        penalties: tuple[Penalty, ...] = ()
+        if commands is not None and self.command_sparsity:
+            share = self.command_sparsity / len(starts)
+            penalties += (Penalty("command_change", share, self._simulated.command_change),)
         if sensors is None:
-            return Maps(parts, self._simulated)
+            return Maps(parts, self._simulated, penalties)
         simulated = self._sensed.starts.to(starts.device)
         box = simulated.amin(0), simulated.amax(0)
         sensors.doubt(starts, *box, DOUBT)
@@ -155,7 +162,7 @@ class SGFT(AbstractMethod):
             far = sensors.outside(starts, *box)
             return self.start_weight * far + self.anchor / len(starts) * sensors.size()
 
-        return Maps(parts, self._simulated, Penalty("sensor_doubt", 1.0, doubt))
+        return Maps(parts, self._simulated, (*penalties, Penalty("sensor_doubt", 1.0, doubt)))
 
     def _corrections(self, model: WorldModel) -> dict[str, float]:
         """What the observation map makes of the sensors, by name: a turn [rad], shifts in raw units."""

@@ -5,7 +5,7 @@ import copy
 import pytest
 import torch
 
-from mpc_sgft.learning.fit import Maps, fit_dynamics
+from mpc_sgft.learning.fit import Maps, Penalty, fit_dynamics
 from mpc_sgft.learning.slices import Slices
 from tests.mpc_sgft.learning.agents import make_agent
 
@@ -46,3 +46,41 @@ def test_a_turned_gain_is_found_and_the_dynamics_stay(simulated: bool) -> None:
         assert off < 0.03 and moved < 1.0
     else:
         assert off > 0.1, "both explain the data, and neither is the truth"
+
+
+def test_the_change_is_the_sum_of_absolute_differences() -> None:
+    dynamics = make_agent(sizes={"obs_dim": 6 + 2 * A, "memory_dim": 2 * A}).model
+    dynamics.add_command_map()
+    assert dynamics.dynamics.command_change() == 0
+    with torch.no_grad():
+        dynamics.dynamics.command.weight[0, 0] = 0.5
+        dynamics.dynamics.command.weight[1, 3] = -0.25
+        dynamics.dynamics.command.bias[1] = 2.0
+    assert dynamics.dynamics.command_change() == 2.75
+
+
+@pytest.mark.parametrize("weight", [0.0, 1e-4])
+def test_few_causes_are_preferred_where_commands_look_alike(weight: float) -> None:
+    """Commands that hardly change tell no lag from another; a weak arm is still found as a weak arm."""
+    torch.manual_seed(0)
+    agent = make_agent(sizes={"obs_dim": 6 + 2 * A, "memory_dim": 2 * A})
+    dynamics = agent.model.dynamics
+    torch.nn.init.orthogonal_(dynamics.base[-1].linear.weight)
+    agent.model.add_command_map()
+    agent.train_only(("dynamics", "dynamics.command"), lr=1e-4, policy_lr=1e-4, command_lr=2e-2)
+    machine = copy.deepcopy(dynamics).requires_grad_(False)
+    machine.command.weight[:] = torch.cat([0.7 * torch.eye(A), torch.zeros(A, 2 * A)], 1)
+    own = copy.deepcopy(dynamics).requires_grad_(False)
+    own.command = dynamics.command
+    agent.model.encode = lambda z: z  # latents in place of observations
+    action = (2 * torch.rand(1, B, A) - 1) + 0.02 * torch.randn(T, B, A)
+    z = [torch.cat([torch.rand(B, 16), action[0].repeat(1, 2) + 0.02 * torch.randn(B, 2 * A)], 1)]
+    for a in action:
+        z.append(machine(z[-1], a))
+    seen = torch.stack(z) + 0.05 * torch.cat([torch.randn(T + 1, B, 16), torch.zeros(T + 1, B, 2 * A)], -1)
+    data = Slices(seen, action, torch.zeros(T, B), torch.zeros(T, B, dtype=torch.bool))
+    sparse = (Penalty("command_change", weight, own.command_change),)
+    for _ in range(500):
+        fit_dynamics(agent, data, rho=1.0, maps=Maps((own.command,), own, sparse))
+    off = (dynamics.command.weight - machine.command.weight).abs().max()
+    assert off < 0.2 if weight else off > 0.35

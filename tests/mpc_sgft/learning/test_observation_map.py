@@ -94,7 +94,7 @@ def test_a_shifted_sensor_is_found(told: bool):
             z.append(Slope()(z[-1], a))
         nothing = torch.zeros(4, 64)
         data = Slices(torch.stack(z) + offset, action, nothing, nothing.bool())
-        fit_dynamics(agent, data, rho=1.0, maps=Maps((sensors,), own, Penalty("doubt", 1.0, doubt)))
+        fit_dynamics(agent, data, rho=1.0, maps=Maps((sensors,), own, (Penalty("doubt", 1.0, doubt),)))
     assert torch.allclose(sensors.shift * sensors.unit, -offset, atol=0.02)
     assert abs(sensors.turn.item()) < 0.05
 
