@@ -12,7 +12,13 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-PAGES = ["tutorials/first-gap.md", "tutorials/own-data.md", "tutorials/own-task.md", "tutorials/robot-rehearsal.md"]
+PAGES = [
+    "tutorials/first-gap.md",
+    "tutorials/own-data.md",
+    "tutorials/own-task.md",
+    "tutorials/robot-rehearsal.md",
+    "benchmark.md",
+]
 BLOCK = re.compile(r"^```(bash|python|yaml)\n(.*?)^```", re.DOTALL | re.MULTILINE)
 
 
