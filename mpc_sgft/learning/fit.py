@@ -1,4 +1,4 @@
-"""One step of what learns from real data: the dynamics, and the maps of commands and observations."""
+"""One step of what learns from real data: the dynamics and the maps of commands and observations, or a whole model."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -91,3 +91,40 @@ def fit_dynamics(
     metrics["grad_norm"] = torch.nn.utils.clip_grad_norm_(agent.model_parameters, agent.grad_clip, foreach=True)
     agent.model_optimizer.step()
     return metrics, encoded
+
+
+@in_own_precision
+def fit_model(
+    agent: Agent, data: Slices, *, rho: float, weight: Tensor | None = None
+) -> tuple[dict[str, Tensor], Tensor]:
+    """One step of TD-MPC2's losses of a model without its critic: encoder, dynamics and reward.
+
+    Args:
+        agent: Whose encoder, dynamics and reward train.
+        data: Slices of T steps.
+        rho: Weight of imagined step t is rho^t.
+        weight: Of each slice, [B], mean one; None weighs all alike.
+
+    Returns:
+        Metrics, and the encoded observations, [T + 1, B, D].
+
+    Raises:
+        FloatingPointError: If a loss is not finite; nothing has changed then.
+    """
+    model = agent.model
+    first = model.encode(data.observation[0])  # [B, D], trains the encoder
+    with torch.no_grad():
+        encoded = torch.cat([first.unsqueeze(0), model.encode(data.observation[1:])])  # [T + 1, B, D]
+    zs = losses.imagine(model.dynamics, first, data.action)
+    target = model.two_hot.encode(data.reward)
+    reward = losses.two_hot_loss(model.reward_logits(zs[:-1], data.action, zs[1:]), target)
+    metrics = {
+        "consistency_loss": losses.over_time((zs[1:] - encoded[1:]).square().mean(-1), rho, weight),
+        "reward_loss": losses.over_time(reward, rho, weight),
+    }
+    check_finite(metrics)
+    agent.model_optimizer.zero_grad()
+    torch.stack([agent.weights[name] * loss for name, loss in metrics.items()]).sum().backward()
+    metrics["grad_norm"] = torch.nn.utils.clip_grad_norm_(agent.model_parameters, agent.grad_clip, foreach=True)
+    agent.model_optimizer.step()
+    return metrics, encoded.detach()

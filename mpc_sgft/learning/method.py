@@ -28,7 +28,8 @@ class AbstractMethod(ABC):
     """What `deploy method=NAME` freezes and what it learns from real rollouts.
 
     configs/method/NAME.yaml names the class and holds its numbers. The planner is that of configs/planner/, on the
-    model that acts; a method that needs another one says so in its yaml (`defaults: [override /planner: NAME]`).
+    model that acts; a method that needs another one says so in its yaml, in `defaults`
+    (`override /planner@_global_.planner: NAME`).
 
     Attributes:
         updates: Gradient steps after each rollout; 0 learns nothing.

@@ -80,3 +80,22 @@ def test_the_numbers_are_those_of_before(words):
     moved = {k: float((now[k] - then[k]).norm()) for k in sorted(now) if now[k].is_floating_point()}
     assert {k: v for k, v in moved.items() if v} == pytest.approx(AS_BEFORE[words]["moved"], rel=1e-3)
     assert [v.accepted for v in t.verdicts] == AS_BEFORE[words]["acting"]
+
+
+def test_a_method_brings_its_planner_and_the_command_line_wins() -> None:
+    def elites(*words: str) -> int:
+        return compose.compose("deploy", [compose.normalise(w) for w in words], list(words)).planner.num_elites
+
+    assert elites("method=sgft_paper") == 16 < elites()
+    assert elites("method=sgft_paper", "planner=cem") == 64
+    assert elites("method=sgft_paper", "planner.num_elites=32") == 32
+
+
+def test_sgft_as_published_learns_the_reward() -> None:
+    """From rollouts that it may learn by heart; `sgft` leaves the reward as it was."""
+    t = make("method=sgft_paper", "method.lr=3e-3")
+    steps = rollout(0)
+    steps["next", "reward"] = steps["next", "observation"][:, :1].clone()
+    t.buffer.extend(steps)
+    curve = [t.method.update(t.agent, t.buffer.sample(), starts=steps["observation"][:1]) for _ in range(150)]
+    assert curve[-1]["reward_loss"] < 0.4 * curve[0]["reward_loss"]
