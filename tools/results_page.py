@@ -283,6 +283,7 @@ STUDIES: dict[str, Callable[[], str]] = {
     "transfer": transfer,
     "outside": lambda: curves(read("outside/sgft.csv"), method_in_gap, "gap and method"),
     "tasks": tasks,
+    "entry": lambda: curves(read("entry/sb3_sac.csv"), lambda r: r["name"], "environment"),
     "audit": audit,
     "ablation": lambda: curves(read("ablation/ablation.csv"), left_out, "gap, and what is left out"),
     "horizon": lambda: curves(read("horizon/horizon.csv"), lambda r: r["variant"], "variant"),
