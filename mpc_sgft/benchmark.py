@@ -23,8 +23,8 @@ from mpc_sgft.command.compose import compose
 from mpc_sgft.command.errors import UserError
 from mpc_sgft.runs import build
 from mpc_sgft.runs.collect import Score, collect, score
-from mpc_sgft.runs.deploy import REAL_SEED
 from mpc_sgft.runs.pretrain import EVAL_SEED
+from mpc_sgft.runs.real_rollout import begin, start_seed
 
 EPISODES = 100  # of an evaluation, as in results/transfer
 PUSH = "turned sluggish skate mild camera offset deadband tilt backlash lopsided warped"
@@ -71,9 +71,9 @@ class RealRollouts(GymEnv):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Floats, dict[str, Any]]:
         gymnasium.Env.reset(self, seed=seed)
-        self.env.set_seed(REAL_SEED + 1000 * self.seed + self.spent + 1)
+        first = begin(self.env, start_seed(self.seed, self.spent + 1)).get("observation")
         self._stage = "ready"
-        return self.env.reset()["observation"][0].numpy(), {"success": False, "invalid": False, "spent": self.spent}
+        return first[0].numpy(), {"success": False, "invalid": False, "spent": self.spent}
 
     def step(self, action: Floats) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
         """As in Gymnasium; `info` also tells the rollouts that are `spent`.
@@ -112,6 +112,7 @@ def evaluate(name: str, act: Callable[[Floats], NDArray[Any]], *, episodes: int 
 
     Raises:
         UserError: If the name is not of the benchmark.
+        ValueError: If `act` gives actions of another shape.
     """
     known = gymnasium.registry.get(name)
     if known is None or not name.startswith("mpc_sgft/"):
@@ -121,7 +122,10 @@ def evaluate(name: str, act: Callable[[Floats], NDArray[Any]], *, episodes: int 
     env = _env(known.kwargs["task"], gap, episodes, randomised=gap == "none")
 
     def chosen(observation: torch.Tensor, fresh: torch.Tensor) -> torch.Tensor:
-        return torch.from_numpy(np.clip(np.asarray(act(observation.numpy()), np.float32), -1.0, 1.0))
+        action = np.asarray(act(observation.numpy()), np.float32)
+        if action.shape != (episodes, env.action_dim):
+            raise ValueError(f"act gave actions of shape {action.shape}; wanted is {(episodes, env.action_dim)}.")
+        return torch.from_numpy(np.clip(action, -1.0, 1.0))
 
     return score(collect(env, chosen, seed=EVAL_SEED))
 

@@ -77,3 +77,11 @@ class AbstractMethod(ABC):
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Go on from `state_dict`, after `take_over`."""
         assert not state, state
+
+
+def check_objective(horizon: int, rho: float) -> None:
+    """Raise ValueError if the horizon is not positive or rho lies outside (0, 1]."""
+    if horizon < 1:
+        raise ValueError(f"horizon={horizon} must be at least one control step.")
+    if not 0 < rho <= 1:
+        raise ValueError(f"rho={rho} must lie in (0, 1].")

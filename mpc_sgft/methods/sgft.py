@@ -11,7 +11,7 @@ from torch import Tensor
 from mpc_sgft.learning.agent import Agent, floats
 from mpc_sgft.learning.dynamics import Dynamics
 from mpc_sgft.learning.fit import Maps, Penalty, fit_dynamics
-from mpc_sgft.learning.method import AbstractMethod, Gate
+from mpc_sgft.learning.method import AbstractMethod, Gate, check_objective
 from mpc_sgft.learning.observation_map import Sensed
 from mpc_sgft.learning.slices import to_slices
 from mpc_sgft.learning.world_model import WorldModel
@@ -80,10 +80,7 @@ class SGFT(AbstractMethod):
         slice_len: int,
         action_noise: float,
     ):
-        if horizon < 1:
-            raise ValueError(f"horizon={horizon} must be at least one control step.")
-        if not 0 < rho <= 1:
-            raise ValueError(f"rho={rho} must lie in (0, 1].")
+        check_objective(horizon, rho)
         self.horizon, self.lr, self.policy_lr, self.command_lr = horizon, lr, policy_lr, command_lr
         self.entropy_coef, self.rho, self.anchor = entropy_coef, rho, anchor
         self.residual, self.command_map, self.command_sparsity = residual, command_map, command_sparsity

@@ -5,7 +5,7 @@ from torch import Tensor
 
 from mpc_sgft.learning.agent import Agent
 from mpc_sgft.learning.fit import fit_model
-from mpc_sgft.learning.method import AbstractMethod
+from mpc_sgft.learning.method import AbstractMethod, check_objective
 from mpc_sgft.learning.observation_map import Sensed
 from mpc_sgft.learning.slices import floats, to_slices
 
@@ -27,6 +27,9 @@ class SGFTPaper(AbstractMethod):
         rho: Weight of step t of the model's losses is rho^t.
         updates, slice_len, action_noise: As in `AbstractMethod`.
 
+    Raises:
+        ValueError: If the horizon is not positive or rho lies outside (0, 1].
+
     Source: Yin, Westenbroek et al., ICLR 2025, Algorithm 3; losses: Hansen, Su, Wang, arXiv:2310.16828.
     """
 
@@ -42,6 +45,7 @@ class SGFTPaper(AbstractMethod):
         slice_len: int,
         action_noise: float,
     ):
+        check_objective(horizon, rho)
         self.horizon, self.lr, self.policy_lr = horizon, lr, policy_lr
         self.entropy_coef, self.rho = entropy_coef, rho
         self.updates, self.slice_len, self.action_noise = updates, slice_len, action_noise

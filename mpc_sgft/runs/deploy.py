@@ -19,7 +19,7 @@ from mpc_sgft.learning.transfer import Transfer, open_loop_error
 from mpc_sgft.runs import build, robot
 from mpc_sgft.runs.collect import Score, collect, planner_policy, score, score_of
 from mpc_sgft.runs.pretrain import EVAL_SEED, StopRequest
-from mpc_sgft.runs.real_rollout import begin, drive
+from mpc_sgft.runs.real_rollout import begin, drive, start_seed
 from mpc_sgft.session import person
 from mpc_sgft.session.operator import Nobody, Operator
 from mpc_sgft.session.verdicts import Verdicts
@@ -29,8 +29,6 @@ from mpc_sgft.storage.metrics import GrowingTable, MetricLogger, progress
 from mpc_sgft.storage.rollout import Rollout, from_episode
 from mpc_sgft.views.deploy_view import DeployViewer
 from planners.policy import PolicyPlanner
-
-REAL_SEED = 2_000_000  # real rollouts never share a seed with evaluation or pretraining
 
 
 def deploy(cfg: DictConfig) -> int:
@@ -188,7 +186,7 @@ class Deployment:
                 action_dim=self.env.action_dim, horizon=cfg.planner.horizon, discount=cfg.task.discount
             )
         model = self.transfer.pretrained if number <= cfg.warmup else self.transfer.acting
-        seed = REAL_SEED + 1000 * cfg.seed + number
+        seed = start_seed(cfg.seed, number)
         self.operator.enter("resetting", number - 1)
         try:
             state = begin(self.env, seed)

@@ -16,6 +16,13 @@ from mpc_sgft.storage.episode_file import EpisodeWriter
 from mpc_sgft.storage.rollout import Rollout
 from planners.base import Plan
 
+REAL_SEED = 2_000_000  # real rollouts never share a seed with evaluation or pretraining
+
+
+def start_seed(seed: int, number: int) -> int:
+    """Seed of the start of rollout `number`, from 1, of a run with a seed."""
+    return REAL_SEED + 1000 * seed + number
+
 
 def drive(
     env: ControlEnv,

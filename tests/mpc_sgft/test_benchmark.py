@@ -14,7 +14,7 @@ from mpc_sgft.command import choices
 from mpc_sgft.command.compose import compose
 from mpc_sgft.command.errors import UserError
 from mpc_sgft.runs import build
-from mpc_sgft.runs.deploy import REAL_SEED
+from mpc_sgft.runs.real_rollout import begin, start_seed
 
 STILL = np.zeros(2, np.float32)
 
@@ -63,8 +63,7 @@ def test_rollouts_start_as_those_of_deploy() -> None:
     second, _ = env.reset(seed=99)
     cfg = compose("deploy", ["gap=turned"], [])
     theirs = build.make_env(cfg, 1)
-    theirs.set_seed(REAL_SEED + 3000 + 2)
-    np.testing.assert_array_equal(second, theirs.reset()["observation"][0].numpy())
+    np.testing.assert_array_equal(second, begin(theirs, start_seed(3, 2))["observation"][0].numpy())
 
 
 @pytest.mark.filterwarnings("ignore")
@@ -91,6 +90,11 @@ def test_a_policy_that_knows_the_gap_scores_and_one_that_does_not_fails() -> Non
 def test_another_name_is_refused() -> None:
     with pytest.raises(UserError, match="push-turned-v0"):
         benchmark.evaluate("CartPole-v1", lambda observation: observation)
+
+
+def test_actions_of_another_shape_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"\(2,\); wanted is \(4, 2\)"):
+        benchmark.evaluate("mpc_sgft/push-sim-v0", lambda observation: STILL, episodes=4)
 
 
 def test_the_page_has_the_names() -> None:

@@ -2,11 +2,11 @@
 
     python -m tools.studies.enter_sb3 results/entry/sb3_sac.csv --gaps push-turned push-mild --rollouts 30
 
-It needs `pip install 'mpc_sgft[sb3]'`. Each row is an evaluation after so many real rollouts; rows are added.
+It needs `pip install 'mpc_sgft[sb3]'`. Each row is an evaluation after so many real rollouts.
 """
 
 import argparse
-import csv
+from functools import partial
 from pathlib import Path
 
 import gymnasium
@@ -14,6 +14,7 @@ import numpy as np
 import torch
 
 from mpc_sgft import benchmark
+from tools.studies.runner import write
 
 COLUMNS = ["name", "method", "seed", "sim_steps", "rollouts", "success", "return", "episodes"]
 
@@ -34,38 +35,30 @@ def main(argv: list[str] | None = None) -> None:
     except ImportError:
         parser.error("stable-baselines3 is not installed: pip install 'mpc_sgft[sb3]'")
     torch.set_num_threads(1)
-    task = args.gaps[0].split("-")[0]
-    sim = gymnasium.make(f"mpc_sgft/{task}-sim-v0")
-    numbers = {"gamma": 0.95, "learning_starts": 1000, "seed": args.seed, "verbose": 0, "device": "cpu"}
+    names = [f"mpc_sgft/{gap}-v0" for gap in args.gaps]
+    real = {name: gymnasium.make(name, rollouts=args.rollouts, seed=args.seed) for name in names}
+    args.csv.parent.mkdir(parents=True, exist_ok=True)
     pretrained = args.csv.with_suffix(".zip")
-    SAC("MlpPolicy", sim, **numbers).learn(args.sim_steps, progress_bar=False).save(pretrained)
-    for gap in args.gaps:
-        name = f"mpc_sgft/{gap}-v0"
-        env = gymnasium.make(name, rollouts=args.rollouts, seed=args.seed)
-        model = SAC.load(pretrained, env=env, device="cpu", learning_starts=0)
-        _write(args, name, model, 0)
-        while (spent := env.unwrapped.spent) < args.rollouts:  # type: ignore[attr-defined]
-            steps = env.unwrapped.env.task.episode_steps * args.eval_every  # type: ignore[attr-defined]
-            model.learn(steps, reset_num_timesteps=False)
-            assert env.unwrapped.spent > spent  # type: ignore[attr-defined]
-            _write(args, name, model, env.unwrapped.spent)  # type: ignore[attr-defined]
+    sim = gymnasium.make(f"mpc_sgft/{args.gaps[0].split('-')[0]}-sim-v0")
+    numbers = {"gamma": 0.95, "learning_starts": 1000, "seed": args.seed, "device": "cpu"}
+    SAC("MlpPolicy", sim, **numbers).learn(args.sim_steps).save(pretrained)
+    rows = []
+    for name, env in real.items():
+        model, reality = SAC.load(pretrained, env=env, device="cpu", learning_starts=0), env.unwrapped
+        assert isinstance(reality, benchmark.RealRollouts)
+        while True:
+            act = partial(model.predict, deterministic=True)
+            result = benchmark.evaluate(name, lambda observation, act=act: np.asarray(act(observation)[0]))
+            done = [name, "sb3 SAC", args.seed, args.sim_steps, reality.spent]
+            scored = [result.success, round(result.episode_return, 3), result.episodes]
+            rows.append(dict(zip(COLUMNS, [*done, *scored], strict=True)))
+            print(rows[-1], flush=True)
+            write(args.csv, COLUMNS, rows)
+            left = args.rollouts - reality.spent
+            if not left:
+                break
+            model.learn(min(args.eval_every, left) * reality.env.task.episode_steps, reset_num_timesteps=False)
     pretrained.unlink()
-
-
-def _write(args: argparse.Namespace, name: str, model, rollouts: int) -> None:
-    def act(observation: np.ndarray) -> np.ndarray:
-        return model.predict(observation, deterministic=True)[0]
-
-    result = benchmark.evaluate(name, act)
-    words = [name, "sb3 SAC", args.seed, args.sim_steps, rollouts]
-    row = dict(zip(COLUMNS, [*words, result.success, round(result.episode_return, 3), result.episodes], strict=True))
-    print(row, flush=True)
-    new = not args.csv.exists()
-    with args.csv.open("a", newline="") as file:
-        writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
-        if new:
-            writer.writeheader()
-        writer.writerow(row)
 
 
 if __name__ == "__main__":
