@@ -1,5 +1,6 @@
 """What MPPI and CEM share: sample plans around a mean, imagine them, move the mean toward the best, and again."""
 
+import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
@@ -24,8 +25,8 @@ from planners.base import (
 class SamplingPlanner(ABC):
     """Iterated sampling over plans [H, A], batched over environments; a concrete planner says how elites weigh.
 
-    Each iteration draws num_candidates - num_prior plans from N(mean, std), adds those of the policy prior (imagined
-    and valued once), keeps the num_elites best and refits
+    Iteration i weighs num_candidates / candidate_decay^i plans: those of the policy prior (imagined and valued once),
+    the rest drawn from N(mean, std). It keeps the best, num_elites of num_candidates, and refits
 
         mean = Σ_k w_k a_k        std = sqrt(Σ_k w_k (a_k - mean)²), clamped to [min_std, max_std]
 
@@ -33,6 +34,8 @@ class SamplingPlanner(ABC):
 
     Raises:
         ValueError: From the constructor, if a number is out of range.
+
+    Source of the decay: Pinneri et al., Sample-efficient cross-entropy method (iCEM), CoRL 2020.
     """
 
     action_dim: int
@@ -40,6 +43,7 @@ class SamplingPlanner(ABC):
     num_candidates: int = 512
     num_prior: int = 24
     num_elites: int = 64
+    candidate_decay: float = 1.0
     iterations: int = 6
     min_std: float = 0.05
     max_std: float = 2.0
@@ -56,10 +60,17 @@ class SamplingPlanner(ABC):
             raise ValueError(f"num_prior={self.num_prior} is outside [0, num_candidates={self.num_candidates}).")
         if self.num_elites > self.num_candidates:
             raise ValueError(f"num_elites={self.num_elites} exceeds num_candidates={self.num_candidates}.")
+        if not self.candidate_decay >= 1:
+            raise ValueError(f"candidate_decay={self.candidate_decay}: it divides the candidates and is at least 1.")
         if self.precision not in PRECISIONS:
             raise ValueError(f"precision={self.precision!r}. Available: {', '.join(PRECISIONS)}.")
         if not 0 < self.min_std <= self.max_std:
             raise ValueError(f"0 < min_std <= max_std does not hold: min_std={self.min_std}, max_std={self.max_std}.")
+
+    def counts(self) -> list[int]:
+        """Candidates of each iteration; at least one is drawn."""
+        wanted = (round(self.num_candidates * self.candidate_decay**-i) for i in range(self.iterations))
+        return [max(self.num_prior + 1, count) for count in wanted]
 
     @abstractmethod
     def weights(self, values: Tensor) -> Tensor:
@@ -106,9 +117,9 @@ class SamplingPlanner(ABC):
             values[:, :prior] = imagined_return(model, latents, pool[:, :prior], self.discount)
 
         returns = plan_values(model, z, self.discount, self.precision, self.chunk_rows)
-        noise = torch.empty_like(pool[:, prior:])
-        for _ in range(self.iterations):
-            noise.normal_(generator=generator)
+        for count in self.counts():
+            pool, values = pool[:, :count], values[:, :count]
+            noise = torch.empty_like(pool[:, prior:]).normal_(generator=generator)
             pool[:, prior:] = torch.addcmul(mean.unsqueeze(1), std.unsqueeze(1), noise).clamp_(-1, 1)
             values[:, prior:] = returns(pool[:, prior:])
             check_finite(who, "candidate values", values)
@@ -126,13 +137,14 @@ class SamplingPlanner(ABC):
     def refit(self, pool: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and clamped std of the elites, each [B, H, A], from candidates [B, N, H, A] and their values [B, N].
 
-        Values are in units of the model's `value_range`.
+        Values are in units of the model's `value_range`. Of fewer candidates fewer are elites, in proportion.
         """
-        top, index = values.topk(self.num_elites, dim=1)
-        elites = pool.gather(1, index[..., None, None].expand(-1, -1, *pool.shape[2:]))  # [B, K, H, A]
+        elites = math.ceil(self.num_elites * values.shape[1] / self.num_candidates)
+        top, index = values.topk(elites, dim=1)
+        best = pool.gather(1, index[..., None, None].expand(-1, -1, *pool.shape[2:]))  # [B, K, H, A]
         weight = self.weights(top)[..., None, None]
-        mean = (weight * elites).sum(1).clamp(-1, 1)  # rounding may leave [-1, 1]
-        variance = (weight * (elites - mean.unsqueeze(1)).square()).sum(1)
+        mean = (weight * best).sum(1).clamp(-1, 1)  # rounding may leave [-1, 1]
+        variance = (weight * (best - mean.unsqueeze(1)).square()).sum(1)
         return mean, variance.sqrt().clamp(self.min_std, self.max_std)
 
     def _warm_start(self, z: Tensor, previous: Plan | None, fresh: Tensor | None) -> Tensor:

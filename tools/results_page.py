@@ -195,7 +195,7 @@ def loop() -> str:
 
 
 def timing() -> str:
-    plan = {name: name for name in ("what", "size", "precision", "horizon", "rows", "threads")}
+    plan = {name: name for name in ("what", "size", "precision", "horizon", "decay", "rows", "threads")}
     plan = {**plan, "median ms": "median_ms", "share of peak": "share_of_peak", "to upstream": "ratio_to_upstream"}
     diagnose = {"what": "what", "s of data": "seconds_of_data", "names": "names", "wall s": "wall_s", "per unit": "per"}
     env = {"task": "task", "what": "what", "physics steps / s": "physics_steps_per_s"}

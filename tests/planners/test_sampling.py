@@ -1,5 +1,7 @@
 """MPPI and CEM: they find known optima, and every part of the search does what it says."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from torch import Tensor
@@ -17,10 +19,12 @@ def seeded(seed: int = 0) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
 
 
+@pytest.mark.parametrize("decay", [1.0, 1.25])
 @pytest.mark.parametrize(
     "planner", [MPPI(action_dim=1, discount=0.95, temperature=0.2), CEM(action_dim=1, discount=0.95)]
 )
-def test_finds_the_riccati_action(double_integrator, planner: MPPI | CEM) -> None:
+def test_finds_the_riccati_action(double_integrator, planner: MPPI | CEM, decay: float) -> None:
+    planner = replace(planner, candidate_decay=decay)
     model = double_integrator(discount=0.95)
     x = torch.rand(8, 2, generator=seeded(1), dtype=torch.float64) * 0.7 - 0.35
     best = -x @ model.gain.T  # [8, 1]
@@ -187,6 +191,19 @@ def test_prior_candidates_stay_in_every_pool_and_are_imagined_once(random_model,
 
 
 @BOTH
+def test_candidates_and_elites_decay_by_hand(random_model, kind: type[MPPI] | type[CEM]) -> None:
+    planner = kind(**SMALL, candidate_decay=2.0)
+    assert planner.counts() == [64, 32, 16]
+    assert kind(**SMALL, candidate_decay=5.0).counts() == [64, 13, 9]  # 64/25 is fewer than the prior's 8 and one more
+    plan = planner.plan(random_model(), torch.randn(3, 6), None, None, seeded(), keep_candidates=True)
+    assert plan.candidates.shape[:2] == plan.candidate_values.shape == (3, 16)
+    best = plan.candidate_values.topk(4).indices  # 16 elites of 64 are 4 of 16
+    elites = plan.candidates.gather(1, best[..., None, None].expand(-1, -1, 4, 2))
+    weight = planner.weights(plan.candidate_values.topk(4).values)[..., None, None]
+    assert_close(plan.mean, (weight * elites).sum(1))
+
+
+@BOTH
 def test_a_good_prior_is_found_among_candidates(double_integrator, kind: type[MPPI] | type[CEM]) -> None:
     """A prior that knows the answer outweighs a search too short to find it."""
     model = double_integrator(discount=0.95)
@@ -222,6 +239,7 @@ def test_exploring_draws_around_the_mean_with_the_final_std(double_integrator, k
         {"num_prior": -1},
         {"num_elites": 513},
         {"iterations": 0},
+        {"candidate_decay": 0.9},
         {"min_std": 0.0},
         {"max_std": 0.01},
         {"chunk_rows": 0},

@@ -5,7 +5,8 @@
 Everything is measured in this process. `share` is the arithmetic of all linear layers, divided by the best time and by
 the fp32 peak beside it, measured before and after the row. `cpu_ms` is processor time: on one thread it is what a quiet
 machine would take, and where it is far below the median the machine was busy. Two threads on busy cores wait for each
-other, and say nothing then. Upstream's figures were measured once, on cores of 95 GFLOP/s.
+other, and say nothing then. `decay` divides the candidates after each iteration. Upstream's figures were measured once,
+on cores of 95 GFLOP/s.
 """
 
 import argparse
@@ -35,6 +36,7 @@ from planners.mppi import MPPI
 ROOT = Path(__file__).resolve().parents[2]
 SPACES = {"small": (22, 2)}  # entries of observation and action: push with its history; others as upstream was measured
 UPSTREAM = (12, 3)
+DECAYS = (1.0, 1.25)  # of the candidates: upstream's search, and one that narrows
 SEARCH = {"num_candidates": 512, "num_prior": 24, "num_elites": 64, "iterations": 6}  # upstream's, for every size
 BATCH = 256  # slices of an update
 UPSTREAM_PEAK = {1: 95.0, 2: 190.0}  # GFLOP/s in fp32 of the cores on which upstream was measured, by threads
@@ -70,7 +72,7 @@ def plan_flop(model: WorldModel, planner: MPPI) -> int:
     The first product of the dynamics on the latent that all candidates start from is not repeated for them.
     """
     f, p = head_flop(model), planner
-    drawn = p.iterations * (p.num_candidates - p.num_prior)
+    drawn = sum(p.counts()) - p.iterations * p.num_prior
     all_heads = (drawn + p.num_prior + 1) * (p.horizon * (f["next"] + f["reward"]) + f["value"])
     shared = drawn * mlp_flop(int(model.sizes["latent_dim"]), int(model.sizes["mlp_dim"]))
     return all_heads - shared + p.num_prior * p.horizon * f["policy"]
@@ -114,22 +116,24 @@ def random_batch(obs_dim: int, action_dim: int, steps: int) -> TensorDict:
     return TensorDict({**now, "next": TensorDict(following, shape)}, shape)
 
 
-def jobs(size: str, precision: str, many: bool) -> list[tuple[str, int, int, int, Callable[[], object]]]:
-    """(what, horizon, rows, flop, call) of everything timed for one model size; `many` plans 100 environments too."""
+def jobs(size: str, precision: str, many: bool) -> list[tuple[str, int, float, int, int, Callable[[], object]]]:
+    """(what, horizon, decay, rows, flop, call) of all that is timed for a model; `many` plans 100 environments too."""
     obs_dim, action_dim = SPACES.get(size, UPSTREAM)
     sizes = {"obs_dim": obs_dim, "action_dim": action_dim, "decode_dim": min(obs_dim, 12)}
     model: WorldModel = instantiate(OmegaConf.load(ROOT / f"configs/model/{size}.yaml"), **sizes)
     train = OmegaConf.load(ROOT / "configs/train/default.yaml")
     agent: Agent = instantiate(train.agent, model=model, discount=0.99, precision=precision)
-    out: list[tuple[str, int, int, int, Callable[[], object]]] = []
+    out: list[tuple[str, int, float, int, int, Callable[[], object]]] = []
     for horizon in (3, 4):
-        planner = MPPI(action_dim=action_dim, horizon=horizon, precision=precision, **SEARCH)
-        for envs in (1, 100) if many and size == "small" and horizon == 4 else (1,):
-            act, fresh = planner_policy(model, planner, seed=0), torch.ones(envs, dtype=torch.bool)
-            act = partial(act, torch.randn(envs, obs_dim), fresh)
-            out.append(("plan", horizon, envs, envs * plan_flop(model, planner), act))
+        for decay in DECAYS if horizon == 4 else (1.0,):
+            numbers = {"action_dim": action_dim, "horizon": horizon, "precision": precision, "candidate_decay": decay}
+            planner = MPPI(**numbers, **SEARCH)
+            for envs in (1, 100) if many and size == "small" and horizon == 4 else (1,):
+                act, fresh = planner_policy(model, planner, seed=0), torch.ones(envs, dtype=torch.bool)
+                act = partial(act, torch.randn(envs, obs_dim), fresh)
+                out.append(("plan", horizon, decay, envs, envs * plan_flop(model, planner), act))
         batch = random_batch(obs_dim, action_dim, horizon)
-        out.append(("update", horizon, BATCH, update_flop(model, horizon), lambda b=batch: agent.update(b)))
+        out.append(("update", horizon, 1.0, BATCH, update_flop(model, horizon), lambda b=batch: agent.update(b)))
     return out
 
 
@@ -147,19 +151,19 @@ def measure(
     """One row for each size, thread count and job, printed as it comes."""
     machine = {"cpu": cpu_name(), "cores": os.cpu_count(), "torch": torch.__version__, "malloc": malloc}
     print(f"{machine['cpu']}, {machine['cores']} cores, torch {machine['torch']}, malloc {malloc}")
-    heads = "what size H precision rows threads median_ms best_ms cpu_ms peak share upstream ratio".split()
+    heads = "what size H precision decay rows threads median_ms best_ms cpu_ms peak share upstream ratio".split()
     print("".join(f"{head:>10}" for head in heads))
     rows = []
     for count in threads:
         torch.set_num_threads(count)
         for size, precision in itertools.product(sizes, precisions):
-            for what, horizon, batch, flop, call in jobs(size, precision, many=repeats > 3):
+            for what, horizon, decay, batch, flop, call in jobs(size, precision, many=repeats > 3):
                 before = peak_gflops(repeats)
                 wall, cpu = seconds(call, repeats if batch != 100 else max(2, repeats // 5))
                 peak = max(before, peak_gflops(repeats))
                 theirs = UPSTREAM_MS.get((what, size, horizon, count))
                 row: dict[str, object] = {"what": what, "size": size, "horizon": horizon, "precision": precision}
-                row |= {"rows": batch, "threads": count}
+                row |= {"decay": decay if what == "plan" else "", "rows": batch, "threads": count}
                 row |= {"median_ms": round(median(wall) * 1e3, 1), "best_ms": round(min(wall) * 1e3, 1)}
                 row |= {"cpu_ms": round(median(cpu) * 1e3, 1), "peak_gflops": round(peak, 1)}
                 row |= {"share_of_peak": round(flop / min(wall) / 1e9 / peak, 3), "upstream_ms": theirs}
