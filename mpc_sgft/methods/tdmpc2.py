@@ -1,31 +1,63 @@
-"""TD-MPC2 on real data: everything goes on training on the ordinary objective, without guidance. The plain baseline."""
+"""TD-MPC2 on real data: everything goes on training on the ordinary objective, without guidance. The baseline."""
 
 from tensordict import TensorDictBase
 from torch import Tensor
 
 from mpc_sgft.learning.agent import PRETRAINED, Agent
-from mpc_sgft.learning.method import AbstractMethod
+from mpc_sgft.learning.method import AbstractMethod, Gate
 from mpc_sgft.learning.observation_map import Sensed
 
 
 class TDMPC2(AbstractMethod):
-    """Every part but the observation's normalisation trains, with pretraining's learning rates and target critics.
+    """Every part but the observation's normalisation trains, with pretraining's target critics.
+
+    What `sgft` adds beside its objective can be given to it too, so that the two objectives are compared alone.
 
     Args:
-        updates, slice_len, action_noise: As in `AbstractMethod`.
+        lr: Of Adam; None: pretraining's.
+        lr_decay: As in `SGFT`.
+        command_map: Also learn what the machine makes of a command, together with the dynamics and by the same loss.
+        command_lr: Of Adam for it.
+        gate, gate_margin, gate_memory: Whether there is a gate, and its numbers (`Gate`).
+        updates, slice_len, action_noise, average_decay, policy_share: As in `AbstractMethod`.
 
     Source: Hansen, Su, Wang, arXiv:2310.16828.
     """
 
-    def __init__(self, *, updates: int, slice_len: int, action_noise: float):
+    def __init__(
+        self,
+        *,
+        lr: float | None,
+        lr_decay: float,
+        command_map: bool,
+        command_lr: float,
+        gate: bool,
+        gate_margin: float,
+        gate_memory: int,
+        average_decay: float,
+        policy_share: float,
+        updates: int,
+        slice_len: int,
+        action_noise: float,
+    ):
+        self.lr, self.lr_decay, self.command_map, self.command_lr = lr, lr_decay, command_map, command_lr
+        self.gate = Gate(gate_margin, gate_memory) if gate else None
+        self.average_decay, self.policy_share = average_decay, policy_share
         self.updates, self.slice_len, self.action_noise = updates, slice_len, action_noise
 
     def take_over(self, agent: Agent, sensed: Sensed) -> None:
-        agent.train_only(PRETRAINED, lr=agent.lr, policy_lr=agent.lr, following=("target_q",))
+        parts = PRETRAINED
+        if self.command_map:
+            if agent.model.dynamics.command is None:
+                agent.model.add_command_map()
+            parts += ("dynamics.command",)
+        lr = agent.lr if self.lr is None else self.lr
+        agent.train_only(parts, lr=lr, policy_lr=lr, command_lr=self.command_lr, following=("target_q",))
 
     def update(
         self, agent: Agent, batch: TensorDictBase, *, starts: Tensor, weight: Tensor | None = None
     ) -> dict[str, float]:
         if weight is not None:
             raise ValueError("method tdmpc2 weighs all slices alike; weight must be None")
+        agent.scale_learning_rates(len(starts) ** -self.lr_decay)
         return agent.update(batch)

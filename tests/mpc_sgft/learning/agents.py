@@ -40,6 +40,8 @@ SENSED = Sensed(("tip_x", "tip_y", "height"), torch.zeros(2, 3))
 SGFT_NUMBERS = dict(
     horizon=4, lr=3e-4, policy_lr=3e-4, entropy_coef=1e-4, rho=0.5, updates=1, **SHARED, **NO_GATE, **OURS
 )
+TDMPC2_NUMBERS = dict(lr=None, lr_decay=0.0, command_map=False, command_lr=2e-2, average_decay=0.0, policy_share=1.0)
+TDMPC2_NUMBERS |= dict(updates=1, **SHARED, **NO_GATE)
 
 
 def hand_over(agent: Agent, name: str = "sgft", **changes):
@@ -47,7 +49,7 @@ def hand_over(agent: Agent, name: str = "sgft", **changes):
     if name == "sgft":
         method = SGFT(**(SGFT_NUMBERS | changes))
     else:
-        method = TDMPC2(updates=1, **SHARED) if name == "tdmpc2" else ZeroShot(**SHARED)
+        method = TDMPC2(**(TDMPC2_NUMBERS | changes)) if name == "tdmpc2" else ZeroShot(**SHARED)
     method.take_over(agent, SENSED)
     return lambda batch, weight=None: method.update(
         agent, batch, starts=torch.zeros(1, agent.model.obs_dim), weight=weight

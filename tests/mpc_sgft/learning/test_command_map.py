@@ -4,10 +4,11 @@ import copy
 
 import pytest
 import torch
+from tensordict import TensorDict
 
 from mpc_sgft.learning.fit import Maps, Penalty, fit_dynamics
 from mpc_sgft.learning.slices import Slices
-from tests.mpc_sgft.learning.agents import make_agent
+from tests.mpc_sgft.learning.agents import hand_over, make_agent
 
 A, T, B = 2, 4, 64
 TRUTH = torch.tensor([[0.5, -0.3], [0.3, 0.5]])  # half of the command, turned
@@ -84,3 +85,30 @@ def test_few_causes_are_preferred_where_commands_look_alike(weight: float) -> No
         fit_dynamics(agent, data, rho=1.0, maps=Maps((own.command,), own, sparse))
     off = (dynamics.command.weight - machine.command.weight).abs().max()
     assert off < 0.2 if weight else off > 0.35
+
+
+@pytest.mark.parametrize("mapped", [True, False])
+def test_tdmpc2_may_be_given_a_command_map(mapped: bool) -> None:
+    """Its own loss finds a turned gain, where the dynamics may hardly move; without the map the error stays."""
+    width = 16 + 2 * A
+    agent = make_agent(sizes={"obs_dim": width, "memory_dim": 2 * A})
+    torch.nn.init.orthogonal_(agent.model.dynamics.base[-1].linear.weight)
+    machine = copy.deepcopy(agent.model)
+    machine.add_command_map()
+    machine.requires_grad_(False)
+    machine.dynamics.command.weight[:] = torch.cat([TRUTH, torch.zeros(A, 2 * A)], 1)
+    update = hand_over(agent, "tdmpc2", command_map=mapped, lr=1e-6)
+    agent.model.encode = lambda z: z  # latents in place of observations
+    generator, errors = torch.Generator().manual_seed(0), []
+    for _ in range(300):
+        action = 2 * torch.rand(T, B, A, generator=generator) - 1
+        z = [torch.cat([torch.rand(B, 16, generator=generator), 2 * torch.rand(B, 2 * A, generator=generator) - 1], 1)]
+        for a in action:
+            z.append(machine.dynamics(z[-1], a))
+        seen, nothing = torch.stack(z).transpose(0, 1), torch.zeros(B, T, 1)
+        following = {"observation": seen[:, 1:], "reward": nothing, "terminated": nothing.bool()}
+        batch = {"observation": seen[:, :-1], "action": action.transpose(0, 1), "next": TensorDict(following, [B, T])}
+        errors.append(update(TensorDict(batch, [B, T]))["consistency_loss"])
+    assert (errors[-1] < 0.1 * errors[0]) == mapped
+    if mapped:
+        assert (agent.model.dynamics.command.weight[:, :A] - TRUTH).abs().max() < 0.05
