@@ -13,6 +13,8 @@ from mpc_sgft.learning.slices import floats, to_slices
 class SGFTPaper(AbstractMethod):
     """Algorithm 3 of the paper, with nothing of ours: encoder, dynamics, reward and policy prior train, V is frozen.
 
+    V is frozen as a function of the latent. Where the encoder trains, V of an observation moves all the same.
+
     The model trains on TD-MPC2's consistency and reward losses. The planner and the policy prior maximise
 
         J = sum_{t<H} gamma^t r_t + gamma^H V(z_H) - V(z_0)
@@ -23,6 +25,7 @@ class SGFTPaper(AbstractMethod):
     Args:
         horizon: Imagined steps of the policy's objective [H].
         lr, policy_lr: Of Adam for the model (the encoder takes its share of it) and the policy prior.
+        encoder, reward: Whether these train; V is a fixed function of the observation only if the encoder does not.
         entropy_coef: Weight of the policy's entropy in its objective, fixed.
         rho: Weight of step t of the model's losses is rho^t.
         updates, slice_len, action_noise: As in `AbstractMethod`.
@@ -39,6 +42,8 @@ class SGFTPaper(AbstractMethod):
         horizon: int,
         lr: float,
         policy_lr: float,
+        encoder: bool,
+        reward: bool,
         entropy_coef: float,
         rho: float,
         updates: int,
@@ -48,10 +53,12 @@ class SGFTPaper(AbstractMethod):
         check_objective(horizon, rho)
         self.horizon, self.lr, self.policy_lr = horizon, lr, policy_lr
         self.entropy_coef, self.rho = entropy_coef, rho
+        self.encoder, self.reward = encoder, reward
         self.updates, self.slice_len, self.action_noise = updates, slice_len, action_noise
 
     def take_over(self, agent: Agent, sensed: Sensed) -> None:
-        parts = ("encoder", "dynamics", "reward_head", "policy_head")
+        parts: tuple[str, ...] = ("dynamics", "policy_head")
+        parts += ("encoder",) * self.encoder + ("reward_head",) * self.reward
         agent.train_only(parts, lr=self.lr, policy_lr=self.policy_lr)
 
     def update(

@@ -69,7 +69,7 @@ def make_env(
             draws = randomize.load(OmegaConf.to_container(cfg.randomize.draws, resolve=True))  # type: ignore[arg-type]
             noise = {"noise_sd": cfg.randomize.noise_sd, "noise_probability": cfg.randomize.noise_probability}
     reward = {"reward": cfg.backend.reward} if "reward" in cfg.get("backend", {}) else {}
-    with from_config("gap"):
+    with from_config("simulation"):
         how = {"threads": threads, "physics": cfg.physics, **noise, **reward}
         backend = SimBackend(task, num_envs, effects=present, draws=draws, **how)
     return ControlEnv(backend, history=cfg.task.history)

@@ -99,3 +99,10 @@ def test_sgft_as_published_learns_the_reward() -> None:
     t.buffer.extend(steps)
     curve = [t.method.update(t.agent, t.buffer.sample(), starts=steps["observation"][:1]) for _ in range(150)]
     assert curve[-1]["reward_loss"] < 0.4 * curve[0]["reward_loss"]
+
+
+def test_encoder_and_reward_may_be_frozen_in_sgft_as_published() -> None:
+    everything = set(make("method=sgft_paper").agent.trainable)
+    assert everything == {"encoder", "dynamics", "reward_head", "policy_head"}
+    assert set(make("method=sgft_paper", "method.encoder=false").agent.trainable) == everything - {"encoder"}
+    assert set(make("method=sgft_paper", "method.reward=false").agent.trainable) == everything - {"reward_head"}

@@ -41,5 +41,5 @@ def test_a_simulated_reality_rewards_what_is_observed_where_that_is_asked_for() 
         ("pretrain", [], False),
     ):
         assert build.make_env(compose.compose(name, given, []), 1).backend.believes is believes
-    with pytest.raises(UserError, match="backend.reward='seen'; allowed: truth, observed"):
+    with pytest.raises(UserError, match="^simulation: backend.reward='seen'; allowed: truth, observed"):
         build.make_env(compose.compose("evaluate", ["backend.reward=seen"], []), 1)

@@ -72,6 +72,9 @@ def test_pretraining_resumes_with_the_same_numbers(pretrained, tmp_path):
     assert [{k: v for k, v in r.items() if k not in skip} for r in ours] == [
         {k: v for k, v in r.items() if k not in skip} for r in theirs
     ]
+    for folder in (pretrained, half):  # planners measure values by the critics' range
+        model = checkpoint.load(folder / "checkpoint" / "model.safetensors").model
+        assert model.value_range == pytest.approx(float(rows(folder)[-1]["scale"])) != 1.0
 
 
 def test_ctrl_c_saves_and_says_how_to_go_on(tmp_path):
