@@ -308,7 +308,7 @@ class TwoHot(nn.Module):
         x = (symlog(value).clamp(self.vmin, self.vmax) - self.vmin) * ((self.num_bins - 1) / (self.vmax - self.vmin))
         low = x.floor().clamp(max=self.num_bins - 2)
         upper = (x - low).unsqueeze(-1)  # share of the upper bin
-        index = low.long().unsqueeze(-1)
+        index = low.long().clamp(0, self.num_bins - 2).unsqueeze(-1)  # NaN has an index too, and stays NaN
         target = torch.zeros(*value.shape, self.num_bins, dtype=value.dtype, device=value.device)
         return target.scatter_(-1, torch.cat([index, index + 1], -1), torch.cat([1 - upper, upper], -1))
 

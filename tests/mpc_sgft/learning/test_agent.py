@@ -157,11 +157,13 @@ def test_an_update_that_is_not_read_is_the_same_update_and_what_was_not_finite_s
         torch.manual_seed(i)
         unread.update(make_batch(i), read=False)
     assert changed(parts(read), parts(unread)) == set()
-    batch = make_batch()
-    batch["next", "reward"][0, 0] = torch.inf
-    unread.update(batch, read=False)
-    with pytest.raises(FloatingPointError, match="^reward is not finite"):
-        unread.update(make_batch())
+    for value in (torch.inf, torch.nan):
+        batch = make_batch()
+        batch["next", "reward"][0, 0] = value
+        unread = make_agent()
+        unread.update(batch, read=False)
+        with pytest.raises(FloatingPointError, match="^reward.* is not finite"):
+            unread.update(make_batch())
 
 
 def test_the_averaged_weights_are_those_of_torchs_own_average():
