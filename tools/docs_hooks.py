@@ -26,7 +26,7 @@ def on_pre_build(config: Any) -> None:
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
     """Fill the places that are marked {{ so }}."""
-    fills = {"results": results_page.page, "ablation": results_page.STUDIES["ablation"]}
+    fills = {"results": results_page.page, "ladder": results_page.ladder}
     fills |= {
         "collect": results_page.collect,
         "growth": results_page.growth,

@@ -129,10 +129,57 @@ def audit() -> str:
     return table(head, [[area, found["runs"], found["gaps"], found["reached"]]]) + "\n\n" + runs
 
 
-def left_out(row: Row) -> str:
-    """The gap of a row and what its variant leaves out."""
-    changes = [change.split("=")[0].split(".")[-1] for change in row["variant"].split()]
-    return f"`{row['gap']}`: " + ("nothing" if not changes else "all of these" if len(changes) > 1 else changes[0])
+ADDITIONS = {  # of ours, by the setting that turns one off; settings that are on together with others have no line
+    "method.command_map": "command map",
+    "method.command_sparsity": "few causes",
+    "method.observation_map": "observation map",
+    "method.anchor": "anchor",
+    "method.gate": "gate",
+    "method.average_decay": "average",
+    "method.policy_share": "prior held back",
+    "method.lr_decay": "falling rates",
+    "method.entropy_coef": "broad prior",
+    "planner.num_elites": "many elites",
+}
+
+
+def rung(row: Row) -> str:
+    """What a run of the ladder has of our additions."""
+    words = [change.split("=")[0] for change in row["variant"].split()]
+    if row["method"] == "sgft_paper":
+        frozen = " and ".join(word.removeprefix("method.") for word in words if word != "method.lr")
+        rate = " at TD-MPC2's rate" if "method.lr" in words else ""
+        return f"`sgft_paper`{rate}, {frozen} frozen" if frozen else f"`sgft_paper`{rate}, as published"
+    named = [ADDITIONS[word] for word in words if word in ADDITIONS]
+    if row["method"] == "tdmpc2":
+        return f"`tdmpc2` with {', '.join(named)}" if named else "`tdmpc2`, plain"
+    if not named:
+        return "`sgft`, all of ours"
+    if len(named) <= 2:
+        return f"all but {', '.join(named)}"
+    kept = [what for what in ADDITIONS.values() if what not in named and what != "few causes"]
+    return f"{', '.join(kept)} alone" if kept else "the objective alone"
+
+
+def ladder() -> str:
+    """Success in each gap after the rollouts, a line for each set of additions."""
+    rows = [row for name in ("sgft_paper", "sgft", "tdmpc2") for row in read(f"ladder/{name}.csv")]
+    gaps = list(dict.fromkeys(row["gap"] for row in rows))
+    last = str(max(int(row["rollouts"]) for row in rows))
+    lines = []
+    for name in dict.fromkeys(map(rung, rows)):
+        mine = [row for row in rows if rung(row) == name and row["rollouts"] == last]
+        cells = [[float(r["success"]) for r in mine if r["gap"] == gap] for gap in gaps]
+        lines.append(
+            [
+                name,
+                *(
+                    f"{spread(values)}, {len(values)} seed{'s' * (len(values) > 1)}" if values else ""
+                    for values in cells
+                ),
+            ]
+        )
+    return table(["additions", *(f"`{gap}`" for gap in gaps)], lines)
 
 
 def blind() -> str:
@@ -200,7 +247,7 @@ def timing() -> str:
     diagnose = {"what": "what", "s of data": "seconds_of_data", "names": "names", "wall s": "wall_s", "per unit": "per"}
     env = {"task": "task", "what": "what", "physics steps / s": "physics_steps_per_s"}
     env |= {"control steps / s": "control_steps_per_s", "ControlEnv / this": "control_env_over_this"}
-    pairs = (("time_planner", plan), ("time_diagnose", diagnose), ("benchmark_env", env))
+    pairs = (("time_planner", plan), ("candidate_decay", plan), ("time_diagnose", diagnose), ("benchmark_env", env))
     parts = [pick(read(f"timing/{file}.csv"), columns) for file, columns in pairs]
     profile = {name: name for name in ("size", "precision", "operation", "ms", "calls")}
     large = [row for row in read("timing/profile_update.csv") if float(row["share"]) >= 0.03]
@@ -285,7 +332,7 @@ STUDIES: dict[str, Callable[[], str]] = {
     "tasks": tasks,
     "entry": lambda: curves(read("entry/sb3_sac.csv"), lambda r: r["name"], "environment"),
     "audit": audit,
-    "ablation": lambda: curves(read("ablation/ablation.csv"), left_out, "gap, and what is left out"),
+    "ladder": ladder,
     "horizon": lambda: curves(read("horizon/horizon.csv"), lambda r: r["variant"], "variant"),
     "pendulum": lambda: curves(read("pendulum/pendulum.csv"), lambda r: r["method"], "method"),
     "critic_profile": critic,

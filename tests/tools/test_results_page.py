@@ -41,3 +41,17 @@ def test_the_commands_in_results_name_tools_that_are_there() -> None:
     for readme in RESULTS.glob("*/README.md"):
         for module in re.findall(r"python -m (tools\.[\w.]+)", readme.read_text()):
             assert (ROOT / (module.replace(".", "/") + ".py")).is_file(), (readme, module)
+
+
+def test_rungs_are_named_by_what_they_have() -> None:
+    def named(method: str, variant: str) -> str:
+        return results_page.rung({"method": method, "variant": variant})
+
+    off = [f"{setting}=0" for setting in results_page.ADDITIONS if "sparsity" not in setting]
+    assert named("sgft", "") == "`sgft`, all of ours"
+    assert named("sgft", " ".join(off)) == "the objective alone"
+    assert named("sgft", " ".join(w for w in off if "gate" not in w)) == "gate alone"
+    assert named("sgft", "method.anchor=0") == "all but anchor"
+    assert named("sgft_paper", "method.encoder=false method.reward=false") == "`sgft_paper`, encoder and reward frozen"
+    assert named("sgft_paper", "method.lr=3e-4") == "`sgft_paper` at TD-MPC2's rate, as published"
+    assert named("tdmpc2", "method.command_map=true method.gate_margin=1") == "`tdmpc2` with command map"
