@@ -72,9 +72,13 @@ def test_pretraining_resumes_with_the_same_numbers(pretrained, tmp_path):
     assert [{k: v for k, v in r.items() if k not in skip} for r in ours] == [
         {k: v for k, v in r.items() if k not in skip} for r in theirs
     ]
-    for folder in (pretrained, half):  # planners measure values by the critics' range
-        model = checkpoint.load(folder / "checkpoint" / "model.safetensors").model
-        assert model.value_range == pytest.approx(float(rows(folder)[-1]["scale"])) != 1.0
+    saved = half / "checkpoint" / "state.pt"  # these critics' range is still the least, 1: as if it had been wider
+    state = checkpoint.load_state(saved)
+    state["agent"]["snapshot"]["scale"] = torch.tensor(3.0)
+    checkpoint.save_state(saved, state)
+    assert run("pretrain", "--resume", str(half), "transitions=2400").returncode == 0
+    model = checkpoint.load(half / "checkpoint" / "model.safetensors").model
+    assert model.value_range == pytest.approx(float(rows(half)[-1]["scale"])) and model.value_range > 1.1
 
 
 def test_ctrl_c_saves_and_says_how_to_go_on(tmp_path):
