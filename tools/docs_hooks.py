@@ -10,6 +10,7 @@ from latex2mathml.converter import convert
 
 from mpc_sgft.command import choices
 from tools import results_page
+from tools.tables import RESULTS, table
 
 ROOT = Path(__file__).resolve().parents[1]
 MATH = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>', re.DOTALL)
@@ -19,7 +20,7 @@ def on_pre_build(config: Any) -> None:
     """Copy the pictures of results/ to where the page looks for them."""
     pictures = Path(config["docs_dir"]) / "results"
     shutil.rmtree(pictures, ignore_errors=True)
-    for png in sorted(results_page.RESULTS.glob("*/*.png")):
+    for png in sorted(RESULTS.glob("*/*.png")):
         (pictures / png.parent.name).mkdir(parents=True, exist_ok=True)
         shutil.copy(png, pictures / png.parent.name / png.name)
 
@@ -63,7 +64,7 @@ def settings() -> str:
     for path in sorted((choices.CONFIG_DIR / "gap").glob("*.yaml")):
         what = yaml.safe_load(path.read_text()).get("effects") or {}
         rows.append([f"`{path.stem}`", "; ".join(f"{k} {v}" for k, v in what.items()).replace("|", "\\|") or "nothing"])
-    return "\n\n".join([*parts, "### gap", results_page.table(["gap=", "what is hidden"], rows)])
+    return "\n\n".join([*parts, "### gap", table(["gap=", "what is hidden"], rows)])
 
 
 def _indent(text: str) -> str:
@@ -80,4 +81,4 @@ def effects() -> str:
     for name in available():
         line = (import_module(f"envs.effects.{name}").__doc__ or "").strip().splitlines()[0]
         rows.append([f"`{name}`", line])
-    return results_page.table(["effect", "what reality has"], rows)
+    return table(["effect", "what reality has"], rows)

@@ -6,57 +6,16 @@
 """
 
 import argparse
-import csv
 import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from statistics import median
 
-ROOT = Path(__file__).resolve().parents[1]
-RESULTS = ROOT / "results"
+from tools.ladder_table import ladder
+from tools.tables import RESULTS, ROOT, Row, curves, digits, minutes, percent, pick, read, spread, table, tenth
+
 TASKS = ("hammer", "insert", "push_towel", "push_ball", "rope_peg_in_hole")
 BEGIN, END = "<!-- headline:begin -->", "<!-- headline:end -->"
-Row = dict[str, str]
-
-
-def read(path: str) -> list[Row]:
-    """Rows of a CSV of results/."""
-    with (RESULTS / path).open(newline="") as file:
-        return list(csv.DictReader(file))
-
-
-def table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
-    """A Markdown table."""
-    lines = [head, ["---"] * len(head), *rows]
-    return "\n".join("| " + " | ".join(str(cell) for cell in line) + " |" for line in lines)
-
-
-def percent(value: str | float) -> str:
-    return f"{100 * float(value):.0f} %"
-
-
-def spread(values: Sequence[float]) -> str:
-    """Median, and lowest to highest where there are several, of shares."""
-    middle = f"{100 * median(values):.0f}"
-    return f"{middle} % ({100 * min(values):.0f}–{100 * max(values):.0f})" if len(set(values)) > 1 else f"{middle} %"
-
-
-def curves(rows: list[Row], key: Callable[[Row], str], name: str) -> str:
-    """Success after each number of rollouts, a line a key: median (lowest-highest) over the seeds."""
-    counts = sorted({int(row["rollouts"]) for row in rows})
-    lines = []
-    for group in dict.fromkeys(map(key, rows)):
-        mine = [row for row in rows if key(row) == group]
-        seeds = len({row["seed"] for row in mine})
-        cells = [[float(r["success"]) for r in mine if int(r["rollouts"]) == n] for n in counts]
-        lines.append([group, seeds, *(spread(values) if values else "" for values in cells)])
-    return table([name, "seeds", *(f"{n} rollouts" for n in counts)], lines)
-
-
-def pick(rows: list[Row], columns: Mapping[str, str | tuple[str, Callable[[str], str]]]) -> str:
-    """Some columns of a CSV as they are, {heading: column or (column, how to write it)}."""
-    how = {head: what if isinstance(what, tuple) else (what, str) for head, what in columns.items()}
-    return table(list(how), [[write(row[name]) if row[name] else "" for name, write in how.values()] for row in rows])
 
 
 def pretrain() -> str:
@@ -71,18 +30,6 @@ def pretrain() -> str:
         f"{name}\n\n{pick(read(f'pretrain/{file}.csv'), head)}"
         for name, file in (("From scratch:", "pretrain"), ("The second stage (`+experiment=polish`):", "polish"))
     )
-
-
-def tenth(value: str) -> str:
-    return f"{100 * float(value):.1f} %"
-
-
-def minutes(value: str) -> str:
-    return f"{float(value) / 60:.1f}"
-
-
-def digits(value: str) -> str:
-    return f"{float(value):.4g}"
 
 
 NAMED = {"gap": "gap", "seed": "seed", "effect": "effect", "parameter": "parameter", "value": ("value", digits)}
@@ -127,59 +74,6 @@ def audit() -> str:
     )
     head = ["area under the curve", "runs", "of gaps", "reached 90 %"]
     return table(head, [[area, found["runs"], found["gaps"], found["reached"]]]) + "\n\n" + runs
-
-
-ADDITIONS = {  # of ours, by the setting that turns one off; settings that are on together with others have no line
-    "method.command_map": "command map",
-    "method.command_sparsity": "few causes",
-    "method.observation_map": "observation map",
-    "method.anchor": "anchor",
-    "method.gate": "gate",
-    "method.average_decay": "average",
-    "method.policy_share": "prior held back",
-    "method.lr_decay": "falling rates",
-    "method.entropy_coef": "broad prior",
-    "planner.num_elites": "many elites",
-}
-
-
-def rung(row: Row) -> str:
-    """What a run of the ladder has of our additions."""
-    words = [change.split("=")[0] for change in row["variant"].split()]
-    if row["method"] == "sgft_paper":
-        frozen = " and ".join(word.removeprefix("method.") for word in words if word != "method.lr")
-        rate = " at TD-MPC2's rate" if "method.lr" in words else ""
-        return f"`sgft_paper`{rate}, {frozen} frozen" if frozen else f"`sgft_paper`{rate}, as published"
-    named = [ADDITIONS[word] for word in words if word in ADDITIONS]
-    if row["method"] == "tdmpc2":
-        return f"`tdmpc2` with {', '.join(named)}" if named else "`tdmpc2`, plain"
-    if not named:
-        return "`sgft`, all of ours"
-    if len(named) <= 2:
-        return f"all but {', '.join(named)}"
-    kept = [what for what in ADDITIONS.values() if what not in named and what != "few causes"]
-    return f"{', '.join(kept)} alone" if kept else "the objective alone"
-
-
-def ladder() -> str:
-    """Success in each gap after the rollouts, a line for each set of additions."""
-    rows = [row for name in ("sgft_paper", "sgft", "tdmpc2") for row in read(f"ladder/{name}.csv")]
-    gaps = list(dict.fromkeys(row["gap"] for row in rows))
-    last = str(max(int(row["rollouts"]) for row in rows))
-    lines = []
-    for name in dict.fromkeys(map(rung, rows)):
-        mine = [row for row in rows if rung(row) == name and row["rollouts"] == last]
-        cells = [[float(r["success"]) for r in mine if r["gap"] == gap] for gap in gaps]
-        lines.append(
-            [
-                name,
-                *(
-                    f"{spread(values)}, {len(values)} seed{'s' * (len(values) > 1)}" if values else ""
-                    for values in cells
-                ),
-            ]
-        )
-    return table(["additions", *(f"`{gap}`" for gap in gaps)], lines)
 
 
 def blind() -> str:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from tools import results_page
-from tools.results_page import BEGIN, END, RESULTS, ROOT, curves, headline, page, write_readme
+from tools import ladder_table, results_page
+from tools.results_page import BEGIN, END, headline, page, write_readme
+from tools.tables import RESULTS, ROOT, curves
 
 
 def test_the_readme_quotes_the_files(tmp_path: Path) -> None:
@@ -45,9 +46,9 @@ def test_the_commands_in_results_name_tools_that_are_there() -> None:
 
 def test_rungs_are_named_by_what_they_have() -> None:
     def named(method: str, variant: str) -> str:
-        return results_page.rung({"method": method, "variant": variant})
+        return ladder_table.rung({"method": method, "variant": variant})
 
-    off = [f"{setting}=0" for setting in results_page.ADDITIONS if "sparsity" not in setting]
+    off = [f"{setting}=0" for setting in ladder_table.ADDITIONS if "sparsity" not in setting]
     assert named("sgft", "") == "`sgft`, all of ours"
     assert named("sgft", " ".join(off)) == "the objective alone"
     assert named("sgft", " ".join(w for w in off if "gate" not in w)) == "gate alone"
