@@ -27,7 +27,8 @@ def rung(row: Row) -> str:
         return f"`sgft_paper`{rate}, {frozen} frozen" if frozen else f"`sgft_paper`{rate}, as published"
     named = [ADDITIONS[word] for word in words if word in ADDITIONS]
     if row["method"] == "tdmpc2":
-        return f"`tdmpc2` with {', '.join(named)}" if named else "`tdmpc2`, plain"
+        rate = " at pretraining's rate" if "method.lr" in words else ""
+        return f"`tdmpc2`{rate} with {', '.join(named)}" if named else f"`tdmpc2`{rate}, plain"
     if not named:
         return "`sgft`, all of ours"
     if len(named) <= 2:
