@@ -162,16 +162,38 @@ def check_discount(discount: float) -> None:
         raise ValueError(f"discount={discount} is outside [0, 1].")
 
 
-def check_finite(who: str, what: str, x: Tensor) -> None:
-    """Raise FloatingPointError that names `what` and the environments in which x [B, ...] is not finite."""
-    if not torch.isfinite(x).all():
-        bad = (~torch.isfinite(x).reshape(len(x), -1).all(1)).nonzero().flatten().tolist()
+class FiniteChecks:
+    """Notes on the device in which environments something was not finite; the host asks once, when all is computed."""
+
+    def __init__(self) -> None:
+        self.names: list[str] = []
+        self._finite: list[Tensor] = []
+
+    def note(self, what: str, x: Tensor) -> None:
+        """Look at x [B, ...]."""
+        self.names.append(what)
+        self._finite.append(torch.isfinite(x).reshape(len(x), -1).all(1))
+
+    def note_followed(self, latents: Tensor, actions: Tensor) -> None:
+        """Look at what `imagine_policy` returned: was it the policy prior or the model that left the finite numbers?"""
+        self.note("policy-prior actions", actions[..., :1, :])
+        self.note("imagined latents", latents)
+        self.note("policy-prior actions", actions)
+
+    def stacked(self) -> Tensor:
+        """Whether it was finite, bool [notes, B]."""
+        return torch.stack(self._finite)
+
+
+def check_finite(who: str, names: list[str], finite: Tensor) -> None:
+    """Raise FloatingPointError that tells the first of `FiniteChecks` that failed, and in which environments.
+
+    Args:
+        who: The planner.
+        names, finite: Of the checks, `finite` as `FiniteChecks.stacked`.
+    """
+    if not finite.all():
+        first = int((~finite.all(1)).nonzero()[0])
+        bad = (~finite[first]).nonzero().flatten().tolist()
         some = ", ".join(map(str, bad[:8])) + (", ..." if len(bad) > 8 else "")
-        raise FloatingPointError(f"{who}: {what} are non-finite (env {some}).")
-
-
-def check_followed(who: str, latents: Tensor, actions: Tensor) -> None:
-    """Check what `imagine_policy` returned, and tell whether policy prior or model left the finite numbers."""
-    check_finite(who, "policy-prior actions", actions[..., :1, :])
-    check_finite(who, "imagined latents", latents)
-    check_finite(who, "policy-prior actions", actions)
+        raise FloatingPointError(f"{who}: {names[first]} are non-finite (env {some}).")

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from planners.base import Model, Plan, check_discount, check_finite, check_followed, imagine_policy, imagined_return
+from planners.base import FiniteChecks, Model, Plan, check_discount, check_finite, imagine_policy, imagined_return
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,12 +41,14 @@ class PolicyPlanner:
 
         Arguments and errors as `SamplingPlanner.plan`; the plan is its own only candidate.
         """
-        check_finite("PolicyPlanner", "latents", z)
+        checks = FiniteChecks()
+        checks.note("latents", z)
         shape = (len(z), self.horizon, self.action_dim)
         noise = torch.randn(shape, generator=generator, device=z.device, dtype=z.dtype) if explore else None
         latents, mean = imagine_policy(model, z, noise, self.horizon)
-        check_followed("PolicyPlanner", latents, mean)
+        checks.note_followed(latents, mean)
         value = imagined_return(model, latents, mean, self.discount)
-        check_finite("PolicyPlanner", "values of the plan", value)
+        checks.note("values of the plan", value)
+        check_finite("PolicyPlanner", checks.names, checks.stacked())
         kept = (mean.unsqueeze(1), value.unsqueeze(1)) if keep_candidates else (None, None)
         return Plan(mean[:, 0], mean, torch.zeros_like(mean), value, *kept)

@@ -2,23 +2,26 @@
 
 import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import partial
+from weakref import WeakKeyDictionary
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from planners.base import (
     PRECISIONS,
+    FiniteChecks,
     Model,
     Plan,
     check_discount,
     check_finite,
-    check_followed,
     h_step_return,
     imagine_policy,
     imagined_return,
     plan_values,
 )
+from planners.cuda_graph import CudaGraphs, addresses
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,6 +53,10 @@ class SamplingPlanner(ABC):
     discount: float = 0.99
     chunk_rows: int = 1024
     precision: str = "auto"
+    cuda_graph: bool = True
+    _graphs: WeakKeyDictionary[nn.Module, CudaGraphs] = field(
+        default_factory=WeakKeyDictionary, init=False, repr=False, compare=False
+    )
 
     def __post_init__(self) -> None:
         check_discount(self.discount)
@@ -103,9 +110,20 @@ class SamplingPlanner(ABC):
                 which, and in which environments.
             ValueError: If `previous` belongs to other sizes.
         """
-        who, prior = type(self).__name__, self.num_prior
-        check_finite(who, "latents", z)
         mean = self._warm_start(z, previous, fresh)  # [B, H, A]
+        if self.cuda_graph and z.is_cuda and isinstance(model, nn.Module):  # whose tensors can be found
+            plan, names, finite = self._replayed(model, generator, z, mean, keep_candidates, explore)
+        else:
+            plan, names, finite = self._search(model, keep_candidates, explore, generator, z, mean)
+        check_finite(type(self).__name__, names, finite)
+        return plan
+
+    def _search(
+        self, model: Model, keep_candidates: bool, explore: bool, generator: torch.Generator, z: Tensor, mean: Tensor
+    ) -> tuple[Plan, list[str], Tensor]:
+        """Search around `mean` [B, H, A]: the plan, and what was looked at on the way, as `check_finite` takes it."""
+        checks, prior = FiniteChecks(), self.num_prior
+        checks.note("latents", z)
         std = torch.full_like(mean, self.max_std)
         pool = z.new_empty(len(z), self.num_candidates, self.horizon, self.action_dim)
         values = z.new_empty(len(z), self.num_candidates)
@@ -113,7 +131,7 @@ class SamplingPlanner(ABC):
             noise = torch.randn(pool[:, :prior].shape, generator=generator, device=z.device, dtype=z.dtype)
             start = z.unsqueeze(1).expand(-1, prior, -1)
             latents, pool[:, :prior] = imagine_policy(model, start, noise, self.horizon)
-            check_followed(who, latents, pool[:, :prior])
+            checks.note_followed(latents, pool[:, :prior])
             values[:, :prior] = imagined_return(model, latents, pool[:, :prior], self.discount)
 
         returns = plan_values(model, z, self.discount, self.precision, self.chunk_rows)
@@ -122,17 +140,35 @@ class SamplingPlanner(ABC):
             noise = torch.empty_like(pool[:, prior:]).normal_(generator=generator)
             pool[:, prior:] = torch.addcmul(mean.unsqueeze(1), std.unsqueeze(1), noise).clamp_(-1, 1)
             values[:, prior:] = returns(pool[:, prior:])
-            check_finite(who, "candidate values", values)
+            checks.note("candidate values", values)
             mean, std = self.refit(pool, values / model.value_range)
-        check_finite(who, "planned actions", mean)
+        checks.note("planned actions", mean)
         value = h_step_return(model, z, mean.unsqueeze(1), self.discount).squeeze(1)
-        check_finite(who, "values of the plan", value)
+        checks.note("values of the plan", value)
         action = mean[:, 0]
         if explore:
             draw = torch.randn(action.shape, generator=generator, device=z.device, dtype=z.dtype)
             action = (action + std[:, 0] * draw).clamp(-1, 1)
         kept = (pool, values) if keep_candidates else (None, None)
-        return Plan(action, mean, std, value, *kept)
+        return Plan(action, mean, std, value, *kept), checks.names, checks.stacked()
+
+    def _replayed(
+        self,
+        model: Model,
+        generator: torch.Generator,
+        z: Tensor,
+        mean: Tensor,
+        keep_candidates: bool,
+        explore: bool,
+    ) -> tuple[Plan, list[str], Tensor]:
+        """`_search` as one CUDA graph for each model, as long as its tensors stay where they are."""
+        assert isinstance(model, nn.Module)
+        graphs = self._graphs.setdefault(model, CudaGraphs())
+        key = (z.shape, keep_candidates, explore, model.value_range, model.training, addresses(model))
+        search = partial(self._search, model, keep_candidates, explore)
+        plan, names, finite = graphs(key, search, (z, mean), generator)
+        copies = {name: x.clone() for name, x in plan._asdict().items() if x is not None}
+        return Plan(**copies), names, finite
 
     def refit(self, pool: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and clamped std of the elites, each [B, H, A], from candidates [B, N, H, A] and their values [B, N].

@@ -31,6 +31,7 @@ def on_page_markdown(markdown: str, **_: Any) -> str:
     fills |= {
         "collect": results_page.collect,
         "growth": results_page.growth,
+        "gpu": results_page.gpu,
         "thousand": results_page.thousand,
         "settings": settings,
     }

@@ -145,7 +145,30 @@ def timing() -> str:
     parts = [pick(read(f"timing/{file}.csv"), columns) for file, columns in pairs]
     profile = {name: name for name in ("size", "precision", "operation", "ms", "calls")}
     large = [row for row in read("timing/profile_update.csv") if float(row["share"]) >= 0.03]
-    return "\n\n".join([*parts, "Where an update's time goes:", pick(large, {**profile, "share": ("share", percent)})])
+    shares = pick(large, {**profile, "share": ("share", percent)})
+    return "\n\n".join([*parts, "Where an update's time goes:", shares, "On a GPU:", gpu()])
+
+
+def gpu() -> str:
+    """Networks with recorded work beside launched work, and what was measured once."""
+    rows = read("timing/gpu_bench.csv")
+    ways: dict[tuple[str, ...], dict[str, str]] = {}
+    for row in rows:
+        if row["size"] and not row["success"] and not row["per_second"]:
+            ways.setdefault((row["what"], row["size"], row["precision"]), {})[row["recorded"]] = row["median_ms"]
+    head = ["what", "size", "precision", "recorded [ms]", "launched [ms]"]
+    networks = table(head, [[*key, of["True"], of["False"]] for key, of in ways.items()])
+    whole = next(row for row in rows if row["what"] == "pretrain push")
+    steps = [row for row in rows if row["what"] == "environment steps"]
+    says = [
+        f"{r['count']} environments, physics={r['size']}: {int(r['per_second']):,} control steps a second"
+        for r in steps
+    ]
+    says.append(
+        f"pretraining push, {int(whole['count']):,} transitions: {float(whole['median_ms']) / 1000:.0f} s, "
+        f"success {percent(whole['success'])}"
+    )
+    return "\n\n".join([f"{whole['device']}, PyTorch {whole['torch']}:", networks, "; ".join(says) + "."])
 
 
 def records(*paths: str) -> str:

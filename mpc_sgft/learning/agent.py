@@ -12,8 +12,9 @@ from torch import Tensor
 from mpc_sgft.learning import losses
 from mpc_sgft.learning.averaged import AveragedWeights
 from mpc_sgft.learning.precision import dtype_of_products, in_own_precision
-from mpc_sgft.learning.slices import FiniteWatch, arranged, floats
+from mpc_sgft.learning.slices import FiniteWatch, Slices, arranged, floats
 from mpc_sgft.learning.world_model import WorldModel
+from planners.cuda_graph import CudaGraphs, addresses
 
 PRETRAINED = ("encoder", "dynamics", "reward_head", "q_ensemble", "value_head", "policy_head", "decoder")
 FOLLOWING = ("normalizer", "target_q")  # not by gradient
@@ -60,6 +61,7 @@ class Agent:
         policy_delay: int = 1,
         td_lambda: float = 0.0,
         precision: str = "float32",
+        cuda_graph: bool = True,
     ) -> None:
         if not 0 <= discount <= 1 or not 0 < rho <= 1:
             raise ValueError(f"discount must lie in [0, 1] and rho in (0, 1], got discount={discount}, rho={rho}.")
@@ -88,6 +90,7 @@ class Agent:
         self.log_entropy_coef = torch.tensor(entropy_coef, device=self.device).log().requires_grad_()
         self._averaged = AveragedWeights(self.model, average_decay)
         self.pretraining, self.imagined_steps = True, 0
+        self._graphs = CudaGraphs() if cuda_graph and self.device.type == "cuda" else None
         self.trainable: tuple[str, ...] = (*PRETRAINED, *FOLLOWING)
         self._make_optimizers(lr, lr)
 
@@ -100,7 +103,11 @@ class Agent:
         """Set the pretraining learning rates to a share of the configured ones."""
         for optimizer in (self.model_optimizer, self.policy_optimizer):
             for group in optimizer.param_groups:
-                group["lr"] = share * group.setdefault("full_lr", group["lr"])
+                rate = share * group.setdefault("full_lr", float(group["lr"]))
+                if isinstance(group["lr"], Tensor):
+                    group["lr"].fill_(rate)
+                else:
+                    group["lr"] = rate
 
     def hold_value(self, held: bool) -> None:
         """Whether encoder and V stay as they are while everything else learns in simulation."""
@@ -121,8 +128,33 @@ class Agent:
         Raises:
             FloatingPointError: If an entry of the batch or a loss is not finite; this update has changed no parameter.
         """
-        model, data = self.model, arranged(batch, self.device)
-        policy_too = self.updates % self.policy_delay == 0
+        data, policy_too = arranged(batch, self.device), self.updates % self.policy_delay == 0
+        if read or self._graphs is None or not self.pretraining:
+            metrics = self._step(data, policy_too, read)
+        else:
+            metrics = self._replayed(self._graphs, data, policy_too)
+        self.updates += 1
+        return floats(metrics) if read else {}
+
+    def _replayed(self, graphs: CudaGraphs, data: Slices, policy_too: bool) -> dict[str, Tensor]:
+        """An update that is not read, as one CUDA graph."""
+
+        def step(generator: torch.Generator, *tensors: Tensor) -> dict[str, Tensor]:
+            kept = self.generator, self._watch
+            self.generator, self._watch = generator, FiniteWatch()
+            try:
+                self._step(Slices(*tensors), policy_too, read=False)
+                return self._watch.taken()
+            finally:
+                self.generator, self._watch = kept
+
+        trains = tuple(p.requires_grad for p in self.model_parameters)
+        key = (policy_too, self.imagined_steps, trains, data.action.shape, addresses(self.model))
+        self._watch.also(graphs(key, step, data, self.generator))
+        return {}
+
+    def _step(self, data: Slices, policy_too: bool, read: bool) -> dict[str, Tensor]:
+        model = self.model
         self._note(data.numbers(), read)
         if self.pretraining:
             model.normalizer.update(data.observation[0])
@@ -160,9 +192,8 @@ class Agent:
         model.update_targets(self.target_rate)
         if self.pretraining:
             self._averaged.follow(model)
-        self.updates += 1
         metrics["target_value"] = target.mean
-        return floats(metrics) if read else {}
+        return metrics
 
     def _note(self, values: Mapping[str, Tensor], check: bool) -> None:
         self._watch.note(values)
@@ -266,8 +297,9 @@ class Agent:
         self.model.load_state_dict(snapshot["model"], strict=False)
         for name, optimizer in self._optimizers().items():
             optimizer.load_state_dict(copy.deepcopy(snapshot["optimizers"][name]))
+        self._prepare_for_graphs()
         self.log_entropy_coef.copy_(snapshot["log_entropy_coef"])
-        self.scale.value = snapshot["scale"].clone()
+        self.scale.value.copy_(snapshot["scale"])
 
     def frozen_hash(self) -> str:
         """SHA-256 of the names and bytes of every tensor of the model that does not train, in hexadecimal."""
@@ -330,6 +362,18 @@ class Agent:
         self.model_optimizer = torch.optim.Adam(groups, fused=True)
         self.policy_optimizer = torch.optim.Adam(model.policy_head.parameters(), lr=policy_lr, eps=1e-5, fused=True)
         self.entropy_optimizer = torch.optim.Adam([self.log_entropy_coef], lr=self.entropy_lr, fused=True)
+        self._prepare_for_graphs()
+
+    def _prepare_for_graphs(self) -> None:
+        """After the optimisers have moved: what they read in a recorded update lies on the device."""
+        recorded = self._graphs is not None and self.pretraining
+        if self._graphs is not None:
+            self._graphs.clear()
+        for optimizer in self._optimizers().values():
+            for group in optimizer.param_groups:
+                rate = float(group["lr"])
+                group["lr"] = torch.tensor(rate, device=self.device) if recorded else rate
+                group["capturable"] = recorded
 
     def _optimizers(self) -> dict[str, torch.optim.Adam]:
         return {"model": self.model_optimizer, "policy": self.policy_optimizer, "entropy": self.entropy_optimizer}
@@ -344,5 +388,7 @@ class Agent:
     def _noise(self, *shape: int) -> Tensor:
         return torch.randn(*shape, self.model.action_dim, generator=self.generator, device=self.device)
 
-    def _two_heads(self) -> list[int]:
+    def _two_heads(self) -> list[int] | Tensor:
+        if self.device.type == "cuda":  # the host is not asked
+            return torch.rand(self.model.num_q, generator=self.generator, device=self.device).argsort()[:2]
         return torch.randperm(self.model.num_q, generator=self._host_generator)[:2].tolist()

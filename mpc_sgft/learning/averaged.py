@@ -21,20 +21,20 @@ class AveragedWeights:
     """
 
     def __init__(self, model: WorldModel, decay: float) -> None:
-        self.model, self.decay, self.updates = copy.deepcopy(model), decay, 0
+        self.model, self.decay, self.begun = copy.deepcopy(model), decay, False
 
     @torch.no_grad()
     def follow(self, model: WorldModel) -> None:
         """Take in the weights after an update."""
-        share = 1 - self.decay if self.updates else 1.0
+        share = 1 - self.decay if self.begun else 1.0
         torch._foreach_lerp_([*self.model.parameters()], [*model.parameters()], share)  # type: ignore
         for there, here in zip(self.model.buffers(), model.buffers(), strict=True):
             there.copy_(here)
-        self.updates += 1
+        self.begun = True
 
     def state_dict(self) -> dict[str, Any]:
-        return {"model": self.model.state_dict(), "updates": self.updates}
+        return {"model": self.model.state_dict(), "begun": self.begun}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         self.model.load_state_dict(state["model"])
-        self.updates = state["updates"]
+        self.begun = state["begun"]

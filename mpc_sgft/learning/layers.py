@@ -250,7 +250,9 @@ def mlp(
 class Ensemble(nn.ModuleList):
     """Members applied one after the other: on a CPU a loop beats vmap. Output [E, ...]."""
 
-    def forward(self, x: Tensor, heads: Sequence[int] | None = None) -> Tensor:
+    def forward(self, x: Tensor, heads: Sequence[int] | Tensor | None = None) -> Tensor:
+        if isinstance(heads, Tensor):  # known to the device only
+            return torch.stack([member(x) for member in self])[heads]
         members = self if heads is None else [self[i] for i in heads]
         return torch.stack([member(x) for member in members])
 

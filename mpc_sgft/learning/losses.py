@@ -103,7 +103,7 @@ def targets(
     encoded: Tensor,
     data: Slices,
     noise: Tensor,
-    heads: Sequence[int] | None,
+    heads: Sequence[int] | Tensor | None,
     discount: float,
     td_lambda: float,
 ) -> Targets:
@@ -119,7 +119,7 @@ def targets(
     """
     ended = torch.cat([torch.zeros_like(data.terminated[:1]), data.terminated])  # [T + 1, B]
     q = model.q(encoded, model.policy(encoded, noise)[0], target=True)  # [E, T + 1, B]
-    pair = q if heads is None else q[list(heads)]
+    pair = q if heads is None else q[heads]
     towards = td_target(data.reward, data.terminated, pair[:, 1:], discount, td_lambda)
     value = value_target(q, ended)
     encode = model.two_hot.encode
@@ -176,5 +176,4 @@ class RunningScale:
     def update(self, x: Tensor) -> Tensor:
         """Take in a batch of any shape; returns the range, a scalar tensor."""
         low, high = torch.quantile(x.flatten(), self.ends)
-        self.value = torch.lerp(self.value, (high - low).clamp_min(1.0), self.rate)
-        return self.value
+        return self.value.lerp_((high - low).clamp_min(1.0), self.rate)

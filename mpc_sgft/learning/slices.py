@@ -55,13 +55,21 @@ class FiniteWatch:
 
     def note(self, values: Mapping[str, Tensor]) -> None:
         """Look at values of any shape."""
-        for name, x in values.items():
-            finite = x.detach().isfinite().all()
-            self._finite[name] = finite & self._finite[name] if name in self._finite else finite
+        self.also({name: x.detach().isfinite().all() for name, x in values.items()})
+
+    def also(self, finite: Mapping[str, Tensor]) -> None:
+        """Take in what was found elsewhere: bool scalars."""
+        for name, found in finite.items():
+            self._finite[name] = found & self._finite[name] if name in self._finite else found.clone()
+
+    def taken(self) -> dict[str, Tensor]:
+        """What was noted since the last time, bool scalars on the device."""
+        noted, self._finite = self._finite, {}
+        return noted
 
     def check(self) -> None:
         """Raise FloatingPointError that names what was not finite since the last check."""
-        noted, self._finite = self._finite, {}
+        noted = self.taken()
         finite = torch.stack([*noted.values()]).tolist() if noted else []
         bad = [name for name, ok in zip(noted, finite, strict=True) if not ok]
         if bad:

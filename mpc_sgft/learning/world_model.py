@@ -161,12 +161,14 @@ class WorldModel(nn.Module):
         return self.reward_head(torch.cat([next_z if self.reward_from == "next" else z, action], -1))
 
     def q_logits(
-        self, z: Tensor, action: Tensor, *, target: bool = False, heads: Sequence[int] | None = None
+        self, z: Tensor, action: Tensor, *, target: bool = False, heads: Sequence[int] | Tensor | None = None
     ) -> Tensor:
         """Two-hot logits of the chosen critics (all by default), [E, ..., num_bins]."""
         return (self.target_q if target else self.q_ensemble)(torch.cat([z, action], -1), heads)
 
-    def q(self, z: Tensor, action: Tensor, *, target: bool = False, heads: Sequence[int] | None = None) -> Tensor:
+    def q(
+        self, z: Tensor, action: Tensor, *, target: bool = False, heads: Sequence[int] | Tensor | None = None
+    ) -> Tensor:
         """Q of the chosen critics (all by default), [E, ...]."""
         return self.two_hot.decode(self.q_logits(z, action, target=target, heads=heads))
 
@@ -222,7 +224,7 @@ class WorldModel(nn.Module):
         raw = int(self.sizes["decode_dim"])
         blocks = (self.obs_dim - self.memory_dim) // raw
         centre, unit = self.normalizer.mean[:raw], self.normalizer.std[:raw]
-        self.observation_map = ObservationMap(points, centre, unit, blocks)
+        self.observation_map = ObservationMap(points, centre, unit, blocks).to(centre.device)
 
     @torch.no_grad()
     def update_targets(self, rate: float) -> None:

@@ -44,9 +44,9 @@ def collect(env: ControlEnv, act: Act, *, seed: int, first_episode: int = 0) -> 
     episode = first_episode + torch.arange(n)
     step, following = torch.zeros(n, dtype=torch.long), first_episode + n
     fresh, rows = torch.ones(n, dtype=torch.bool), []
-    for _ in range(env.task.episode_steps):
+    for left in reversed(range(env.task.episode_steps)):
         state["action"] = act(state["observation"], fresh)
-        row, state = env.step_and_maybe_reset(state)
+        row, state = env.step_and_maybe_reset(state) if left else (env.step(state), state)  # no start is made unused
         row["episode"], row["step"] = episode, step
         rows.append(row)
         fresh = row["next", "done"][:, 0]

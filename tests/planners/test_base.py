@@ -6,7 +6,15 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from planners.base import check_finite, h_step_return, imagine, imagine_policy, imagined_return, sgft_objective
+from planners.base import (
+    FiniteChecks,
+    check_finite,
+    h_step_return,
+    imagine,
+    imagine_policy,
+    imagined_return,
+    sgft_objective,
+)
 
 
 def test_h_step_return_by_hand() -> None:
@@ -73,11 +81,18 @@ def test_latents_that_do_not_go_with_the_plans_are_refused(random_model, shape: 
         h_step_return(random_model(), torch.zeros(shape), torch.zeros(3, 5, 4, 2), 0.9)
 
 
-def test_check_finite_names_the_environments() -> None:
+def test_the_first_check_that_failed_is_told_with_its_environments() -> None:
+    def checked(x: torch.Tensor) -> None:
+        checks = FiniteChecks()
+        checks.note("latents", torch.zeros(12, 2))
+        checks.note("candidate values", x)
+        checks.note("planned actions", torch.full((12, 3, 2), float("nan")) if not x.isfinite().all() else x)
+        check_finite("MPPI", checks.names, checks.stacked())
+
     x = torch.zeros(12, 2)
-    check_finite("MPPI", "candidate values", x)
+    checked(x)
     x[3, 1] = float("inf")
     with pytest.raises(FloatingPointError, match=r"^MPPI: candidate values are non-finite \(env 3\)\.$"):
-        check_finite("MPPI", "candidate values", x)
-    with pytest.raises(FloatingPointError, match=r"env 0, 1, 2, 3, 4, 5, 6, 7, \.\.\."):
-        check_finite("MPPI", "latents", torch.full((12, 2), float("nan")))
+        checked(x)
+    with pytest.raises(FloatingPointError, match=r"values are .* \(env 0, 1, 2, 3, 4, 5, 6, 7, \.\.\."):
+        checked(torch.full((12, 2), float("nan")))

@@ -1,9 +1,10 @@
 """What a GPU brings: plans, updates, environment steps, and pretraining push end to end.
 
-    python -m tools.benchmarks.gpu_bench [--sizes 1M 5M 48M] [--envs 4096] [--pretrain] [--out CSV]
+    python -m tools.benchmarks.gpu_bench [--sizes 1M 5M 48M] [--envs 4096] [--pretrain DIR] [--out CSV]
 
-Each row is measured after a call that is not counted, with the device waited for before the clock is read. An update
-is one of twenty of which the last is read, as in pretraining. `--device cpu` runs the same on the processor: to see
+Each row is measured after calls that are not counted, with the device waited for before the clock is read. Plans and
+updates are measured as recorded CUDA graphs and as single launches. An update is one of twenty of which the last is
+read, as in pretraining. `--device cpu` runs the same on the processor: to see
 that it works, or to compare.
 """
 
@@ -13,6 +14,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from itertools import product
 from pathlib import Path
 from statistics import median
 
@@ -29,30 +31,32 @@ from planners.mppi import MPPI
 from tools.benchmarks.time_planner import ROOT, SEARCH, UPSTREAM, cpu_name, random_batch
 from tools.studies.runner import write
 
-COLUMNS = ["what", "size", "precision", "count", "median_ms", "per_second", "success", "device", "torch"]
+COLUMNS = ["what", "size", "precision", "recorded", "count", "median_ms", "per_second", "success", "device", "torch"]
 UPDATES = 20  # of which the last is read
+SETTLED = 4  # calls that are not counted: the first ones compile, and record
 
 
 def seconds(call: Callable[[], object], repeats: int, device: torch.device) -> float:
-    """Median time [s] of a call that the device has finished, after one that is not counted."""
+    """Median time [s] of a call that the device has finished."""
     found = []
-    for _ in range(repeats + 1):
+    for _ in range(repeats + SETTLED):
         start = time.perf_counter()
         call()
         if device.type == "cuda":
             torch.cuda.synchronize(device)
         found.append(time.perf_counter() - start)
-    return median(found[1:])
+    return median(found[SETTLED:])
 
 
-def networks(size: str, precision: str, device: torch.device, repeats: int) -> list[dict[str, object]]:
+def networks(size: str, precision: str, recorded: bool, device: torch.device, repeats: int) -> list[dict[str, object]]:
     """One plan (H = 4, upstream's search) and one update (256 slices of 3 steps)."""
     obs_dim, action_dim = UPSTREAM
     sizes = {"obs_dim": obs_dim, "action_dim": action_dim, "decode_dim": obs_dim}
     model: WorldModel = instantiate(OmegaConf.load(ROOT / f"configs/model/{size}.yaml"), **sizes)
     numbers = OmegaConf.load(ROOT / "configs/train/default.yaml").agent
-    agent: Agent = instantiate(numbers, model=model, discount=0.99, precision=precision, device=device)
-    planner = MPPI(action_dim=action_dim, horizon=4, precision=precision, **SEARCH)
+    how = {"precision": precision, "cuda_graph": recorded}
+    agent: Agent = instantiate(numbers, model=model, discount=0.99, device=device, **how)
+    planner = MPPI(action_dim=action_dim, horizon=4, **how, **SEARCH)
     act, batch = planner_policy(agent.model, planner, seed=0), random_batch(obs_dim, action_dim, 3).to(device)
     observation, fresh = torch.randn(1, obs_dim), torch.zeros(1, dtype=torch.bool)
 
@@ -62,8 +66,9 @@ def networks(size: str, precision: str, device: torch.device, repeats: int) -> l
 
     plan = seconds(lambda: act(observation, fresh), repeats, device)
     update = seconds(updates, max(1, repeats // 5), device) / UPDATES
+    row = {"size": size, "precision": precision, "recorded": recorded, "count": 1}
     return [
-        {"what": what, "size": size, "precision": precision, "count": 1, "median_ms": round(1e3 * found, 2)}
+        {"what": what, **row, "median_ms": round(1e3 * found, 3)}
         for what, found in (("plan", plan), ("update", update))
     ]
 
@@ -78,9 +83,9 @@ def environments(count: int, physics: str, repeats: int, device: torch.device) -
     return row | {"count": count, "median_ms": round(1e3 * found, 1), "per_second": round(steps / found)}
 
 
-def pretraining(device: torch.device, folder: Path) -> dict[str, object]:
-    """Push from scratch with the default settings on the device."""
-    words = ["task=push", f"device={device.type}", f"run_dir={folder}", "quiet=true"]
+def pretraining(device: torch.device, folder: Path, settings: list[str]) -> dict[str, object]:
+    """Push from scratch on the device."""
+    words = ["task=push", f"device={device.type}", f"run_dir={folder}", "quiet=true", *settings]
     subprocess.run([sys.executable, "-m", "mpc_sgft.pretrain", *words], check=True)
     done = json.loads((folder / "summary.json").read_text())
     row = {"what": "pretrain push", "size": "small", "precision": "auto", "count": done["transitions"]}
@@ -95,6 +100,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--physics", nargs="+", default=["warp", "mujoco"], choices=["warp", "mujoco"])
     parser.add_argument("--repeats", type=int, default=20)
     parser.add_argument("--pretrain", type=Path, metavar="DIR", help="also pretrain push, into this new folder")
+    parser.add_argument("--settings", nargs="*", default=[], help="of this pretraining, beside the default ones")
     parser.add_argument("--out", type=Path, default=ROOT / "results/timing/gpu_bench.csv")
     args = parser.parse_args(arguments)
     device = torch.device(args.device)
@@ -109,13 +115,15 @@ def main(arguments: list[str] | None = None) -> int:
         write(args.out, COLUMNS, rows)
 
     for size in args.sizes:
-        for precision in ("float32", "bfloat16"):
-            for found in networks(size, precision, device, args.repeats):
+        for precision, recorded in product(
+            ("float32", "bfloat16"), (True, False) if device.type == "cuda" else (False,)
+        ):
+            for found in networks(size, precision, recorded, device, args.repeats):
                 keep(found)
     for physics in args.physics if args.envs else []:
         keep(environments(args.envs, physics, max(1, args.repeats // 10), device))
     if args.pretrain is not None:
-        keep(pretraining(device, args.pretrain))
+        keep(pretraining(device, args.pretrain, args.settings))
     print(f"written to {args.out}")
     return 0
 

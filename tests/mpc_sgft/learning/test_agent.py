@@ -6,9 +6,11 @@ import pytest
 import torch
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from torch.testing import assert_close
-from torch.utils._python_dispatch import TorchDispatchMode
 
+from mpc_sgft.learning.agent import Agent
 from mpc_sgft.learning.world_model import PARTS
+from planners.cuda_graph import WARM_UP
+from tests.host_reads import NoWaiting
 from tests.mpc_sgft.learning.agents import (
     changed,
     make_agent,
@@ -112,14 +114,6 @@ def test_a_loss_that_is_not_finite_is_named_and_changes_nothing():
     assert changed(before, parts(agent)) == {"normalizer", "reward_head"}  # nan is never equal to itself
 
 
-class _NoWaiting(TorchDispatchMode):
-    """Refuses what brings a number from the device to the host."""
-
-    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
-        assert func is not torch.ops.aten._local_scalar_dense.default, "the host waits for the device"
-        return func(*args, **(kwargs or {}))
-
-
 @pytest.mark.parametrize("delay", [1, 2])
 def test_the_host_waits_for_no_update_that_is_not_read(monkeypatch, delay):
     agent = make_agent({"dropout": 0.0}, policy_delay=delay)  # on a CPU dropout counts its entries there
@@ -128,7 +122,7 @@ def test_the_host_waits_for_no_update_that_is_not_read(monkeypatch, delay):
     def refuse(*_):
         raise AssertionError("the host waits for the device")
 
-    with monkeypatch.context() as patch, _NoWaiting():
+    with monkeypatch.context() as patch, NoWaiting():
         for name in ("tolist", "item", "numpy", "cpu", "__bool__", "__float__", "__int__"):
             patch.setattr(torch.Tensor, name, refuse)
         assert agent.update(make_batch(1), read=False) == {}
@@ -137,16 +131,75 @@ def test_the_host_waits_for_no_update_that_is_not_read(monkeypatch, delay):
 
 
 @pytest.mark.gpu
-def test_the_host_waits_for_no_update_on_a_gpu_either():
-    agent = make_agent(device="cuda")
+@pytest.mark.parametrize("num_q", [2, 5])
+def test_the_host_waits_for_no_update_on_a_gpu_either(num_q):
+    for cuda_graph in (False, True):
+        agent = make_agent(sizes={"num_q": num_q}, device="cuda", cuda_graph=cuda_graph)
+        batch = make_batch().to("cuda")
+        for _ in range(WARM_UP + 2):
+            agent.update(batch, read=False)
+        torch.cuda.set_sync_debug_mode("error")
+        try:
+            agent.update(batch, read=False)
+        finally:
+            torch.cuda.set_sync_debug_mode("default")
+        assert agent.update(batch)["loss"] > 0
+
+
+def gpu_agents(**changes) -> list[Agent]:
+    """The same agent twice, with and without recorded updates."""
+    sizes = {"num_q": 5, "dropout": 0.01}
+    return [make_agent(sizes=sizes, device="cuda", cuda_graph=on, **changes) for on in (True, False)]
+
+
+def learn(agent: Agent, start: int, count: int) -> None:
+    """Updates of which the last is read, at a rate that falls."""
+    torch.cuda.manual_seed(start)  # of dropout
+    for i in range(start, start + count):
+        agent.scale_learning_rates(0.9**i)
+        agent.update(make_batch(i).to("cuda"), read=i == start + count - 1)
+
+
+def assert_alike(one: Agent, other: Agent) -> None:
+    for mine, theirs in ((one.model, other.model), (one.averaged, other.averaged)):
+        for (name, a), b in zip(mine.state_dict().items(), theirs.state_dict().values(), strict=True):
+            torch.testing.assert_close(a, b, atol=2e-5, rtol=1e-4, msg=lambda text, name=name: f"{name}: {text}")
+    torch.testing.assert_close(one.scale.value, other.scale.value)
+    assert one.updates == other.updates and torch.equal(one.generator.get_state(), other.generator.get_state())
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("changes", [{}, {"policy_delay": 2}])
+def test_recorded_updates_are_those_that_are_launched(changes):
+    recorded, launched = gpu_agents(**changes)
+    for agent in (recorded, launched):
+        agent.hold_value(True)
+        learn(agent, 0, 10)
+        agent.hold_value(False)
+        learn(agent, 10, 10)
+    assert_alike(recorded, launched)
+    before = recorded.snapshot()
     batch = make_batch().to("cuda")
-    agent.update(batch)
-    torch.cuda.set_sync_debug_mode("error")
-    try:
-        agent.update(batch, read=False)
-    finally:
-        torch.cuda.set_sync_debug_mode("default")
-    assert agent.update(batch)["loss"] > 0
+    batch["next", "reward"][0, 0] = torch.nan
+    recorded.update(batch, read=False)
+    with pytest.raises(FloatingPointError, match="^reward.* is not finite"):
+        recorded.update(make_batch().to("cuda"))
+    recorded.restore(before)
+    assert recorded.update(make_batch().to("cuda"))["loss"] > 0
+
+
+@pytest.mark.gpu
+def test_recorded_updates_go_on_where_they_were_saved():
+    whole, first = (gpu_agents()[0] for _ in range(2))
+    learn(whole, 0, 8)
+    learn(whole, 8, 8)
+    learn(first, 0, 8)
+    state = copy.deepcopy(first.state_dict())
+    resumed = gpu_agents()[0]
+    learn(resumed, 40, 5)  # it has recordings of its own, of something else
+    resumed.load_state_dict(state)
+    learn(resumed, 8, 8)
+    assert_alike(whole, resumed)
 
 
 def test_an_update_that_is_not_read_is_the_same_update_and_what_was_not_finite_shows_in_the_next():

@@ -117,6 +117,12 @@ def test_residual_starts_exactly_equal_and_only_it_trains():
         model.add_residual()
 
 
+def test_what_is_added_lies_where_the_model_does():
+    model = tiny(memory_dim=4).to("meta")  # a device like any other here
+    model.add_residual(), model.add_command_map(), model.add_observation_map([[0, 1]])
+    assert {x.device.type for x in (*model.parameters(), *model.buffers())} == {"meta"}
+
+
 def test_dropout_only_in_critics_while_training_and_never_in_targets():
     model = tiny(dropout=0.5)
     for head in model.q_ensemble:

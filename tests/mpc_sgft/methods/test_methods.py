@@ -36,11 +36,11 @@ def rollout(seed: int, steps: int = 12) -> TensorDict:
     return TensorDict({"observation": observation[:-1], "action": action, **number, "next": following}, [steps])
 
 
-def make(*overrides: str) -> Transfer:
+def make(*overrides: str, device: str = "cpu") -> Transfer:
     given = ["train.replay.batch_size=16", *overrides]
     cfg = compose.compose("deploy", [compose.normalise(text) for text in given], given)
     torch.manual_seed(0)
-    agent: Agent = instantiate(cfg.train.agent, model=WorldModel(**SIZES), seed=0, device="cpu", discount=0.9)
+    agent: Agent = instantiate(cfg.train.agent, model=WorldModel(**SIZES), seed=0, device=device, discount=0.9)
     return make_transfer(cfg, agent, Sensed(("tip_x", "tip_y"), torch.zeros(2, 2)), 12)
 
 
@@ -67,6 +67,17 @@ def test_a_method_changes_what_it_says_and_nothing_else(name):
     expected, again = t.learn(rollout(3)), make(f"method={name}")
     again.load_state_dict(saved)
     assert again.learn(rollout(3)) == expected
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("name", METHODS)
+def test_a_method_learns_on_a_gpu(name):
+    t = make(f"method={name}", device="cuda")
+    for seed in range(2):
+        t.learn(rollout(seed))
+    z = t.agent.model.encode(torch.zeros(3, 6, device="cuda"))
+    assert z.is_cuda and z.isfinite().all()
+    assert {x.device.type for x in t.agent.model.state_dict().values()} == {"cuda"}
 
 
 @pytest.mark.parametrize("words", AS_BEFORE)
