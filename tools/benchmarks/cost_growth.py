@@ -3,7 +3,8 @@
     python -m tools.benchmarks.cost_growth [--parts plan start disk] [--repeats 20] [--out CSV]
 
 `plan`: one thread; each row changes one number of the first one, and `ratio` is to that one, measured beside it.
-`start`: seconds until a command has said `--help`, and until a deployment has recorded its first rollout.
+`start`: seconds until a command has said `--help`, until the libraries under every command are imported, and until a
+deployment has recorded its first rollout.
 `disk`: bytes that ten more rollouts of push add to run.rrd and to the episodes, a rollout.
 """
 
@@ -26,6 +27,8 @@ from tools.studies.runner import write
 
 COLUMNS = ["part", "what", "value", "amount", "unit", "ratio", "cpu"]
 BASE = {"num_candidates": 128, "horizon": 4, "environments": 1, "model": "small"}
+COMMANDS = ("pretrain", "deploy", "evaluate", "diagnose")
+LIBRARIES = ("torch", "tensordict", "torchrl.envs")  # each imports those before it
 VARIED = {
     "num_candidates": [128, 256, 512, 1024, 2048],
     "horizon": [1, 2, 4, 8, 16],
@@ -67,13 +70,15 @@ def plans(repeats: int) -> list[dict[str, object]]:
 def starts(repeats: int) -> list[dict[str, object]]:
     """Seconds of `--help` of each command, and of a deployment of one rollout until it is on disk."""
     rows = []
-    for name in ("pretrain", "deploy", "evaluate", "diagnose"):
+    lines = {f"{name} --help": ["-m", f"mpc_sgft.{name}", "--help"] for name in COMMANDS}
+    lines |= {f"import {name}": ["-c", f"import {name}"] for name in LIBRARIES}
+    for what, words in lines.items():
         took = []
         for _ in range(repeats):
             start = time.perf_counter()
-            subprocess.run([sys.executable, "-m", f"mpc_sgft.{name}", "--help"], check=True, stdout=subprocess.DEVNULL)
+            subprocess.run([sys.executable, *words], check=True, stdout=subprocess.DEVNULL)
             took.append(time.perf_counter() - start)
-        rows.append(_row("start", f"{name} --help", "", median(took), "s"))
+        rows.append(_row("start", what, "", median(took), "s"))
     took = []
     for _ in range(repeats):
         with tempfile.TemporaryDirectory() as folder:
