@@ -15,6 +15,9 @@ PRECISIONS = ("auto", "float32", "bfloat16")  # of a model's matrix products
 class Model(Protocol):
     """A learned world. Every method takes any leading batch dimensions [...]; a class satisfies it by having them.
 
+    On a GPU a plan with an `nn.Module` is recorded: its parameters and buffers are read anew in each plan, everything
+    else stays what it was then.
+
     Attributes:
         value_range: How far apart the values of good and of bad states are, reward units, above 0. Planners measure
             values by it, so that the same settings serve tasks whose rewards are large or small.

@@ -54,21 +54,31 @@ class CudaGraphs:
         Raises:
             RuntimeError: If `work` cannot be recorded.
         """
+        with torch.cuda.device(inputs[0].device):
+            return self._run(key, work, inputs, generator)
+
+    def _run(
+        self, key: Hashable, work: Callable[..., Outputs], inputs: Sequence[Tensor], generator: torch.Generator
+    ) -> Outputs:
         found = self._recorded.get(key)
         if found is None:
-            calls = self._calls[key] = self._calls.get(key, 0) + 1
+            calls = self._calls[key] = self._calls.pop(key, 0) + 1
             if calls <= WARM_UP:
+                _forget_oldest(self._calls, 8 * self.most)
                 return _aside(work, inputs, generator)
-            if len(self._recorded) >= self.most:
-                oldest = next(iter(self._recorded))
-                del self._recorded[oldest], self._calls[oldest]
             found = self._recorded[key] = _record(work, inputs)
+            _forget_oldest(self._recorded, self.most)
         for there, here in zip(found.inputs, inputs, strict=True):
             there.copy_(here)
         found.generator.set_state(generator.get_state())
         found.graph.replay()
         generator.set_state(found.generator.get_state())
         return found.outputs
+
+
+def _forget_oldest(kept: dict[Hashable, Any], most: int) -> None:
+    while len(kept) > most:
+        del kept[next(iter(kept))]
 
 
 def _aside(work: Callable[..., Outputs], inputs: Sequence[Tensor], generator: torch.Generator) -> Outputs:

@@ -250,6 +250,7 @@ STUDIES: dict[str, Callable[[], str]] = {
     "entry": lambda: curves(read("entry/sb3_sac.csv"), lambda r: r["name"], "environment"),
     "audit": audit,
     "ladder": ladder,
+    "model_free": lambda: curves(read("model_free/model_free.csv"), method_in_gap, "gap and method"),
     "horizon": lambda: curves(read("horizon/horizon.csv"), lambda r: r["variant"], "variant"),
     "pendulum": lambda: curves(read("pendulum/pendulum.csv"), lambda r: r["method"], "method"),
     "critic_profile": critic,

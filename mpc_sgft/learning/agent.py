@@ -132,11 +132,12 @@ class Agent:
         if read or self._graphs is None or not self.pretraining:
             metrics = self._step(data, policy_too, read)
         else:
-            metrics = self._replayed(self._graphs, data, policy_too)
+            self._replayed(self._graphs, data, policy_too)
+            metrics = {}
         self.updates += 1
         return floats(metrics) if read else {}
 
-    def _replayed(self, graphs: CudaGraphs, data: Slices, policy_too: bool) -> dict[str, Tensor]:
+    def _replayed(self, graphs: CudaGraphs, data: Slices, policy_too: bool) -> None:
         """An update that is not read, as one CUDA graph."""
 
         def step(generator: torch.Generator, *tensors: Tensor) -> dict[str, Tensor]:
@@ -149,9 +150,9 @@ class Agent:
                 self.generator, self._watch = kept
 
         trains = tuple(p.requires_grad for p in self.model_parameters)
-        key = (policy_too, self.imagined_steps, trains, data.action.shape, addresses(self.model))
+        where = self.model.training, addresses(self.model)
+        key = (policy_too, self.imagined_steps, trains, data.action.shape, *where)
         self._watch.also(graphs(key, step, data, self.generator))
-        return {}
 
     def _step(self, data: Slices, policy_too: bool, read: bool) -> dict[str, Tensor]:
         model = self.model
@@ -161,8 +162,8 @@ class Agent:
         first_z = model.encode(data.observation[0])  # [B, D], trains the encoder
         with torch.no_grad():
             encoded = torch.cat([first_z.unsqueeze(0), model.encode(data.observation[1:])])  # [T + 1, B, D]
-        noise = self._noise(*encoded.shape[:-1])
-        heads = None if model.num_q == 2 else self._two_heads()
+        noise = self.noise(*encoded.shape[:-1])
+        heads = self.two_heads()
         target = losses.targets(model, encoded, data, noise, heads, self.discount, self.td_lambda)
 
         zs = losses.imagine(model.dynamics, first_z, data.action)  # [T + 1, B, D]
@@ -201,13 +202,13 @@ class Agent:
             self._watch.check()
 
     def _update_policy(self, zs: Tensor, read: bool) -> dict[str, Tensor]:
-        action, log_prob = self.model.policy(zs, self._noise(*zs.shape[:-1]))
-        heads = None if self.model.num_q == 2 else self._two_heads()
+        action, log_prob = self.model.policy(zs, self.noise(*zs.shape[:-1]))
+        heads = self.two_heads()
         q = self.model.q(zs, action, heads=heads)  # [2, T + 1, B]
         scale = self.scale.update(q.detach()[:, 0])
         coef = self.log_entropy_coef.detach().exp()
         loss = losses.over_time(losses.policy_loss(q, log_prob, coef, scale), self.rho)
-        metrics = self._step_policy(loss, log_prob, read) | {"entropy_coef": coef, "scale": scale}
+        metrics = self.step_policy(loss, log_prob, read) | {"entropy_coef": coef, "scale": scale}
         self._tune_entropy(log_prob)
         return metrics
 
@@ -220,13 +221,14 @@ class Agent:
     def _climb(
         self, starts: Tensor, horizon: int, coef: Tensor | float, read: bool
     ) -> tuple[dict[str, Tensor], Tensor]:
-        noise = self._noise(horizon, len(starts))
+        noise = self.noise(horizon, len(starts))
         objective, log_prob = losses.imagined_objective(self.model, starts, noise, self.discount)
         scale = self.scale.update(objective.detach())
-        metrics = self._step_policy(coef * log_prob.mean() - objective.mean() / scale, log_prob, read)
+        metrics = self.step_policy(coef * log_prob.mean() - objective.mean() / scale, log_prob, read)
         return metrics | {"objective": objective.mean(), "scale": scale}, log_prob
 
-    def _step_policy(self, loss: Tensor, log_prob: Tensor, read: bool) -> dict[str, Tensor]:
+    def step_policy(self, loss: Tensor, log_prob: Tensor, read: bool = True) -> dict[str, Tensor]:
+        """A step of the policy prior down a loss of its own actions, whose log-density is given."""
         self._note({"policy_loss": loss}, read)
         parameters = list(self.model.policy_head.parameters())
         self.policy_optimizer.zero_grad()
@@ -385,10 +387,14 @@ class Agent:
         wanted = self.model.normalizer(observation)[..., : self.model.sizes["decode_dim"]]
         return (self.model.decoder(z.detach()) - wanted).square().mean(-1)
 
-    def _noise(self, *shape: int) -> Tensor:
+    def noise(self, *shape: int) -> Tensor:
+        """Standard normal numbers for actions, [*shape, A]."""
         return torch.randn(*shape, self.model.action_dim, generator=self.generator, device=self.device)
 
-    def _two_heads(self) -> list[int] | Tensor:
+    def two_heads(self) -> list[int] | Tensor | None:
+        """Which two critics' minimum counts now; None if there are no more."""
+        if self.model.num_q == 2:
+            return None
         if self.device.type == "cuda":  # the host is not asked
             return torch.rand(self.model.num_q, generator=self.generator, device=self.device).argsort()[:2]
         return torch.randperm(self.model.num_q, generator=self._host_generator)[:2].tolist()

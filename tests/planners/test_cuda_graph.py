@@ -79,7 +79,7 @@ def test_a_replay_names_what_is_not_finite(random_model, z: Tensor) -> None:
 
 ASKS = """
 import torch
-from planners.cuda_graph import WARM_UP
+from planners.cuda_graph import WARM_UP, CudaGraphs
 graphs, x, generator = CudaGraphs(), torch.ones(3, device="cuda"), torch.Generator("cuda")
 for call in range(WARM_UP + 1):
     assert graphs("asks", lambda generator, x: x * float(x.sum()), (x,), generator).sum() == 9
