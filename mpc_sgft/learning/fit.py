@@ -44,7 +44,6 @@ def fit_dynamics(
     data: Slices,
     *,
     rho: float,
-    weight: Tensor | None = None,
     penalty: Penalty | None = None,
     maps: Maps | None = None,
 ) -> tuple[dict[str, Tensor], Tensor]:
@@ -54,7 +53,6 @@ def fit_dynamics(
         agent: Whose dynamics train.
         data: Slices of T steps.
         rho: Weight of imagined step t is rho^t.
-        weight: Of each slice, [B], mean one; None weighs all alike.
         penalty: On the dynamics.
         maps: How the maps learn; None: what the dynamics hold of them learns with these.
 
@@ -69,7 +67,7 @@ def fit_dynamics(
 
     def error(dynamics: nn.Module, encoded: Tensor) -> Tensor:  # its targets are no constants: the maps move them
         zs = losses.imagine(dynamics, encoded[0], data.action)
-        return losses.over_time((zs[1:] - encoded[1:]).square().mean(-1), rho, weight)
+        return losses.over_time((zs[1:] - encoded[1:]).square().mean(-1), rho)
 
     def with_penalties(loss: Tensor, penalties: tuple[Penalty, ...]) -> Tensor:
         for penalty in penalties:
@@ -94,16 +92,13 @@ def fit_dynamics(
 
 
 @in_own_precision
-def fit_model(
-    agent: Agent, data: Slices, *, rho: float, weight: Tensor | None = None
-) -> tuple[dict[str, Tensor], Tensor]:
+def fit_model(agent: Agent, data: Slices, *, rho: float) -> tuple[dict[str, Tensor], Tensor]:
     """One step of TD-MPC2's losses of a model without its critic: encoder, dynamics and reward.
 
     Args:
         agent: Whose encoder, dynamics and reward train.
         data: Slices of T steps.
         rho: Weight of imagined step t is rho^t.
-        weight: Of each slice, [B], mean one; None weighs all alike.
 
     Returns:
         Metrics, and the encoded observations, [T + 1, B, D].
@@ -119,8 +114,8 @@ def fit_model(
     target = model.two_hot.encode(data.reward)
     reward = losses.two_hot_loss(model.reward_logits(zs[:-1], data.action, zs[1:]), target)
     metrics = {
-        "consistency_loss": losses.over_time((zs[1:] - encoded[1:]).square().mean(-1), rho, weight),
-        "reward_loss": losses.over_time(reward, rho, weight),
+        "consistency_loss": losses.over_time((zs[1:] - encoded[1:]).square().mean(-1), rho),
+        "reward_loss": losses.over_time(reward, rho),
     }
     check_finite(metrics)
     agent.model_optimizer.zero_grad()

@@ -19,16 +19,15 @@ from mpc_sgft.learning.slices import Slices
 from mpc_sgft.learning.world_model import WorldModel
 
 
-def over_time(loss: Tensor, rho: float, weight: Tensor | None = None) -> Tensor:
-    """Scalar (1/T) sum_t rho^t mean_b weight_b loss_tb.
+def over_time(loss: Tensor, rho: float) -> Tensor:
+    """Scalar (1/T) sum_t rho^t mean_b loss_tb.
 
     Args:
         loss: [T, B].
         rho: Decay per imagined step, in (0, 1]; later steps carry the errors of earlier ones.
-        weight: Per slice, [B], mean one; None weighs all alike.
     """
     steps = torch.arange(loss.shape[0], dtype=loss.dtype, device=loss.device)
-    mean = (loss if weight is None else loss * weight).mean(1)  # [T]
+    mean = loss.mean(1)  # [T]
     return (rho**steps * mean).mean()
 
 

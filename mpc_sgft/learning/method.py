@@ -57,14 +57,13 @@ class AbstractMethod(ABC):
         """
 
     @abstractmethod
-    def update(self, agent: Agent, batch: TensorDictBase, *, starts: Tensor, weight: Tensor | None = None) -> dict:
+    def update(self, agent: Agent, batch: TensorDictBase, *, starts: Tensor) -> dict:
         """One step on slices [B, T] of real data; returns metrics, {name: float}.
 
         Args:
             agent: That this method took over.
             batch: As from the buffer.
             starts: The first observation of each rollout so far, [R, O].
-            weight: Of each slice, [B], mean one; None weighs all alike.
 
         Raises:
             FloatingPointError: If an entry of the batch or a loss is not finite; that loss has changed nothing then.

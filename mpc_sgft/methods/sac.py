@@ -41,10 +41,6 @@ class SAC(AbstractMethod):
         """What is learned from, made of what was seen; `slice_len` consecutive steps, time first."""
         return found
 
-    def update(
-        self, agent: Agent, batch: TensorDictBase, *, starts: Tensor, weight: Tensor | None = None
-    ) -> dict[str, float]:
-        if weight is not None:
-            raise ValueError(f"method {type(self).__name__} weighs all slices alike; weight must be None")
+    def update(self, agent: Agent, batch: TensorDictBase, *, starts: Tensor) -> dict[str, float]:
         found = self.transitions(agent, of_slices(agent.model, to_slices(batch, agent.device)))
         return floats(fit_soft(agent, found, entropy_coef=self.entropy_coef))

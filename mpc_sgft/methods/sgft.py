@@ -118,9 +118,7 @@ class SGFT(AbstractMethod):
             self._simulated = copy.deepcopy(model.dynamics).requires_grad_(False)
             self._simulated.residual, self._simulated.command = None, model.dynamics.command
 
-    def update(
-        self, agent: Agent, batch: TensorDictBase, *, starts: Tensor, weight: Tensor | None = None
-    ) -> dict[str, float]:
+    def update(self, agent: Agent, batch: TensorDictBase, *, starts: Tensor) -> dict[str, float]:
         def distance() -> Tensor:
             moved = zip(agent.dynamics_parameters(), self._pretrained, strict=True)
             return torch.stack([(now - then).square().sum() for now, then in moved]).sum()
@@ -131,7 +129,6 @@ class SGFT(AbstractMethod):
             agent,
             to_slices(batch, agent.device),
             rho=self.rho,
-            weight=weight,
             penalty=Penalty("anchor_distance", self.anchor / rollouts, distance) if self.anchor else None,
             maps=self._maps(agent.model, starts),
         )

@@ -61,8 +61,6 @@ class SGFTPaper(AbstractMethod):
         parts += ("encoder",) * self.encoder + ("reward_head",) * self.reward
         agent.train_only(parts, lr=self.lr, policy_lr=self.policy_lr)
 
-    def update(
-        self, agent: Agent, batch: TensorDictBase, *, starts: Tensor, weight: Tensor | None = None
-    ) -> dict[str, float]:
-        metrics, encoded = fit_model(agent, to_slices(batch, agent.device), rho=self.rho, weight=weight)
+    def update(self, agent: Agent, batch: TensorDictBase, *, starts: Tensor) -> dict[str, float]:
+        metrics, encoded = fit_model(agent, to_slices(batch, agent.device), rho=self.rho)
         return floats(metrics | agent.climb(encoded[0], horizon=self.horizon, entropy_coef=self.entropy_coef))

@@ -63,11 +63,7 @@ class SGFTSAC(AbstractMethod):
         agent.train_only(parts, lr=self.lr, policy_lr=self.policy_lr, following=("target_q",))
         forget_critics(agent.model)
 
-    def update(
-        self, agent: Agent, batch: TensorDictBase, *, starts: Tensor, weight: Tensor | None = None
-    ) -> dict[str, float]:
-        if weight is not None:
-            raise ValueError("method sgft_sac weighs all slices alike; weight must be None")
+    def update(self, agent: Agent, batch: TensorDictBase, *, starts: Tensor) -> dict[str, float]:
         data, steps = to_slices(batch, agent.device), self.slice_len
         metrics, _ = fit_dynamics(agent, data, rho=self.rho)
         parts = [of_slices(agent.model, data)]

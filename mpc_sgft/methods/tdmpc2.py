@@ -54,10 +54,6 @@ class TDMPC2(AbstractMethod):
         lr = agent.lr if self.lr is None else self.lr
         agent.train_only(parts, lr=lr, policy_lr=lr, command_lr=self.command_lr, following=("target_q",))
 
-    def update(
-        self, agent: Agent, batch: TensorDictBase, *, starts: Tensor, weight: Tensor | None = None
-    ) -> dict[str, float]:
-        if weight is not None:
-            raise ValueError("method tdmpc2 weighs all slices alike; weight must be None")
+    def update(self, agent: Agent, batch: TensorDictBase, *, starts: Tensor) -> dict[str, float]:
         agent.scale_learning_rates(len(starts) ** -self.lr_decay)
         return agent.update(batch)

@@ -23,5 +23,5 @@ class ZeroShot(AbstractMethod):
     def take_over(self, agent: Agent, sensed: Sensed) -> None:
         agent.train_only((), lr=agent.lr, policy_lr=agent.lr)
 
-    def update(self, agent: Agent, batch: TensorDictBase, *, starts: Tensor, weight: Tensor | None = None) -> dict:
+    def update(self, agent: Agent, batch: TensorDictBase, *, starts: Tensor) -> dict:
         raise ValueError("method zero_shot learns nothing: it has no update")

@@ -51,9 +51,7 @@ def hand_over(agent: Agent, name: str = "sgft", **changes):
     else:
         method = TDMPC2(**(TDMPC2_NUMBERS | changes)) if name == "tdmpc2" else ZeroShot(**SHARED)
     method.take_over(agent, SENSED)
-    return lambda batch, weight=None: method.update(
-        agent, batch, starts=torch.zeros(1, agent.model.obs_dim), weight=weight
-    )
+    return lambda batch: method.update(agent, batch, starts=torch.zeros(1, agent.model.obs_dim))
 
 
 def make_agent(sizes=None, **changes) -> Agent:

@@ -69,17 +69,6 @@ def test_transfer_lowers_the_model_error_on_what_it_saw():
     assert model_error(agent, batch).mean() < 0.7 * before.mean()
 
 
-def test_slice_weights_choose_what_the_dynamics_learn():
-    agent = pretrained()
-    update = hand_over(agent, lr=3e-3)
-    batch, weight = make_batch(77, batch=16), torch.tensor([2.0, 0.0]).repeat(8)
-    before = model_error(agent, batch)
-    for _ in range(150):
-        update(batch, weight)
-    ratio = model_error(agent, batch).mean(1) / before.mean(1)
-    assert ratio[::2].mean() < ratio[1::2].mean() - 0.1
-
-
 def test_anchor_keeps_the_dynamics_near_the_pretrained_ones():
     def distance(anchor):
         agent = pretrained()

@@ -40,10 +40,9 @@ def test_a_terminal_state_is_worth_nothing_whatever_the_critic_says():
     assert_close(losses.value_target(q, torch.tensor([[False, True]])), torch.tensor([[6.0, 0.0]]))
 
 
-def test_over_time_weighs_by_rho_and_by_slice():
+def test_over_time_weighs_by_rho():
     loss = torch.tensor([[1.0, 3.0], [10.0, 10.0]])  # [T, B]
     assert losses.over_time(loss, 0.5).item() == pytest.approx((2.0 + 0.5 * 10.0) / 2)
-    assert losses.over_time(loss, 0.5, torch.tensor([2.0, 0.0])).item() == pytest.approx((1.0 + 0.5 * 10.0) / 2)
 
 
 def test_consistency_is_zero_on_equal_latents_and_never_trains_the_target():
