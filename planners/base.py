@@ -108,6 +108,11 @@ def plan_values(model: Model, z: Tensor, discount: float, precision: str, rows: 
     """`QuickModel.plan_values`, or `h_step_return` for a model that has no such thing and only its own precision."""
     if hasattr(model, "plan_values"):
         return cast(QuickModel, model).plan_values(z, discount, precision, rows)
+    return step_by_step(model, z, discount, rows)
+
+
+def step_by_step(model: Model, z: Tensor, discount: float, rows: int) -> Callable[[Tensor], Tensor]:
+    """`h_step_return` of plans [B, N, H, A] from z [B, D], `rows` plans at a time on a CPU."""
 
     def returns(plans: Tensor) -> Tensor:
         starts = z.repeat_interleave(plans.shape[1], 0)

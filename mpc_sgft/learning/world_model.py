@@ -7,7 +7,7 @@ be one frozen, deterministic function of the latent; Q(z, pi(z)) would move with
 """
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor, nn
@@ -17,6 +17,7 @@ from mpc_sgft.learning.layers import Ensemble, Normalizer, SimNorm, TwoHot, by_b
 from mpc_sgft.learning.observation_map import ObservationMap
 from mpc_sgft.learning.plan_values import PlanValues, PlanWeights
 from mpc_sgft.learning.precision import dtype_of_products
+from planners.base import step_by_step
 
 PARTS = (
     "normalizer",
@@ -30,6 +31,7 @@ PARTS = (
     "decoder",
 )
 REWARD_FROM = ("next", "current")
+TERMINALS = ("value", "q")
 LOG_STD_MIN, LOG_STD_MAX = -10.0, 2.0
 
 
@@ -54,10 +56,12 @@ class WorldModel(nn.Module):
         dropout: Probability on the first layer of every critic while training.
         reward_from: "next": reward is read from the latent it is received in, so that it cannot hide the simulator's
             dynamics; "current": from (z, a), as TD-MPC2 has it.
+        terminal: What an imagined plan ends in: the "value" head, or "q", the mean of the target critics at the action
+            of the policy, as TD-MPC2 has it (there of two critics that drop out).
 
     Raises:
         ValueError: If latent_dim is no multiple of simnorm_dim, decode_dim exceeds obs_dim, num_q < 2, or reward_from
-            is unknown.
+            or terminal is unknown.
     """
 
     def __init__(
@@ -78,6 +82,7 @@ class WorldModel(nn.Module):
         vmax: float = 10.0,
         dropout: float = 0.01,
         reward_from: str = "next",
+        terminal: str = "value",
     ) -> None:
         self_sizes = {k: v for k, v in locals().items() if k not in ("self", "__class__")}
         super().__init__()
@@ -93,6 +98,8 @@ class WorldModel(nn.Module):
             raise ValueError(f"num_q={num_q}: the target is the minimum of two critics, so at least 2 are needed.")
         if reward_from not in REWARD_FROM:
             raise ValueError(f"reward_from={reward_from!r}. Available: {', '.join(REWARD_FROM)}.")
+        if terminal not in TERMINALS:
+            raise ValueError(f"terminal={terminal!r}. Available: {', '.join(TERMINALS)}.")
         self.sizes: dict[str, int | float | str] = self_sizes  # what rebuilds this model: WorldModel(**sizes)
         self.obs_dim, self.action_dim, self.memory_dim = obs_dim, action_dim, memory_dim
         self.latent_dim = latent_dim + memory_dim
@@ -128,6 +135,8 @@ class WorldModel(nn.Module):
 
     def terminal_value(self, z: Tensor) -> Tensor:
         """V(z), discounted reward units, [...]; at transfer the frozen V sees each command as it was realised."""
+        if self.sizes["terminal"] == "q":
+            return by_blocks(lambda s: self.q(s, self.policy_prior(s, None), target=True).mean(0), z)
         return by_blocks(lambda s: self.two_hot.decode(self.value_head(self.dynamics.as_simulated(s))), z)
 
     def policy_prior(self, z: Tensor, noise: Tensor | None) -> Tensor:
@@ -135,8 +144,13 @@ class WorldModel(nn.Module):
         mean, log_std = self._policy_moments(z)
         return torch.tanh(mean if noise is None else mean + log_std.exp() * noise)
 
-    def plan_values(self, z: Tensor, discount: float, precision: str, rows: int) -> PlanValues:
-        """Values many plans from the latents z [B, D] at once, in the precision of configs/planner/mppi.yaml."""
+    def plan_values(self, z: Tensor, discount: float, precision: str, rows: int) -> Callable[[Tensor], Tensor]:
+        """Values many plans from the latents z [B, D] at once, in the precision of configs/planner/mppi.yaml.
+
+        With `terminal` "q" step by step, in float32.
+        """
+        if self.sizes["terminal"] == "q":
+            return step_by_step(self, z, discount, rows)
         dtype = dtype_of_products(precision, int(self.sizes["mlp_dim"]), z.device)
         heads = self.reward_head, self.value_head
         weights = PlanWeights(self.dynamics, *heads, self.two_hot, reward_from=self.reward_from, dtype=dtype)

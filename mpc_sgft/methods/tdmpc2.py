@@ -6,6 +6,7 @@ from torch import Tensor
 from mpc_sgft.learning.agent import PRETRAINED, Agent
 from mpc_sgft.learning.method import AbstractMethod, Gate
 from mpc_sgft.learning.observation_map import Sensed
+from mpc_sgft.learning.world_model import TERMINALS
 
 
 class TDMPC2(AbstractMethod):
@@ -16,6 +17,8 @@ class TDMPC2(AbstractMethod):
     Args:
         lr: Of Adam; None: pretraining's.
         lr_decay: As in `SGFT`.
+        terminal: What plans end in: "value", the head that all methods here share, or "q", the critics at the policy's
+            action, as published.
         command_map: Also learn what the machine makes of a command, together with the dynamics and by the same loss.
         command_lr: Of Adam for it.
         gate, gate_margin, gate_memory: Whether there is a gate, and its numbers (`Gate`).
@@ -29,6 +32,7 @@ class TDMPC2(AbstractMethod):
         *,
         lr: float | None,
         lr_decay: float,
+        terminal: str,
         command_map: bool,
         command_lr: float,
         gate: bool,
@@ -40,12 +44,16 @@ class TDMPC2(AbstractMethod):
         slice_len: int,
         action_noise: float,
     ):
+        if terminal not in TERMINALS:
+            raise ValueError(f"terminal={terminal!r}. Available: {', '.join(TERMINALS)}.")
+        self.terminal = terminal
         self.lr, self.lr_decay, self.command_map, self.command_lr = lr, lr_decay, command_map, command_lr
         self.gate = Gate(gate_margin, gate_memory) if gate else None
         self.average_decay, self.policy_share = average_decay, policy_share
         self.updates, self.slice_len, self.action_noise = updates, slice_len, action_noise
 
     def take_over(self, agent: Agent, sensed: Sensed) -> None:
+        agent.model.sizes["terminal"] = self.terminal
         parts = PRETRAINED
         if self.command_map:
             if agent.model.dynamics.command is None:

@@ -40,7 +40,9 @@ SENSED = Sensed(("tip_x", "tip_y", "height"), torch.zeros(2, 3))
 SGFT_NUMBERS = dict(
     horizon=4, lr=3e-4, policy_lr=3e-4, entropy_coef=1e-4, rho=0.5, updates=1, **SHARED, **NO_GATE, **OURS
 )
-TDMPC2_NUMBERS = dict(lr=None, lr_decay=0.0, command_map=False, command_lr=2e-2, average_decay=0.0, policy_share=1.0)
+TDMPC2_NUMBERS = dict(
+    lr=None, lr_decay=0.0, terminal="value", command_map=False, command_lr=2e-2, average_decay=0.0, policy_share=1.0
+)
 TDMPC2_NUMBERS |= dict(updates=1, **SHARED, **NO_GATE)
 
 

@@ -48,6 +48,23 @@ def test_values_are_the_h_step_return(reward_from: str, memory: int, command: bo
 
 
 @torch.inference_mode()
+def test_plans_may_end_in_the_critics_at_the_policys_action() -> None:
+    model = model_with(memory=6)
+    z, plans = model.encode(torch.randn(3, 14)), torch.rand(3, 50, 4, 2) * 2 - 1
+    before = h_step_return(model, z, plans, 0.9)
+    model.sizes["terminal"] = "q"
+    last = z.unsqueeze(1).expand(-1, 50, -1)
+    rewards = torch.zeros(3, 50)
+    for t, action in enumerate(plans.unbind(2)):
+        last, now = model.next(last, action), last
+        rewards += 0.9**t * model.reward(now, action, last)
+    by_hand = rewards + 0.9**4 * model.q(last, model.policy_prior(last, None), target=True).mean(0)
+    assert_close(model.train().plan_values(z, 0.9, "bfloat16", 64)(plans), by_hand, rtol=1e-4, atol=1e-4)
+    assert (by_hand - before).abs().mean() > 0.1
+    assert WorldModel(**model.sizes).sizes["terminal"] == "q"  # a checkpoint goes on with it
+
+
+@torch.inference_mode()
 def test_bfloat16_orders_plans_as_float32_does() -> None:
     model = model_with(memory=6, command=True)
     z, plans = model.encode(torch.randn(4, 14)), torch.rand(4, 400, 4, 2) * 2 - 1

@@ -144,6 +144,7 @@ def test_dropout_only_in_critics_while_training_and_never_in_targets():
         ({"decode_dim": 11}, "obs_dim=10"),
         ({"num_q": 1}, "2"),
         ({"reward_from": "x"}, "next"),
+        ({"terminal": "x"}, "value, q"),
     ],
 )
 def test_wrong_sizes_stop_with_the_value(change, message):
