@@ -4,8 +4,7 @@
 
 Each row is measured after calls that are not counted, with the device waited for before the clock is read. Plans and
 updates are measured as recorded CUDA graphs and as single launches. An update is one of twenty of which the last is
-read, as in pretraining. `--device cpu` runs the same on the processor: to see
-that it works, or to compare.
+read, as in pretraining. `--device cpu` runs the same on the processor: to see that it works, or to compare.
 """
 
 import argparse
