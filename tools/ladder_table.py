@@ -28,6 +28,7 @@ def rung(row: Row) -> str:
     named = [ADDITIONS[word] for word in words if word in ADDITIONS]
     if row["method"] == "tdmpc2":
         rate = " at pretraining's rate" if "method.lr" in words else ""
+        rate += " and plans that end in Q" if "method.terminal" in words else ""
         return f"`tdmpc2`{rate} with {', '.join(named)}" if named else f"`tdmpc2`{rate}, plain"
     if not named:
         return "`sgft`, all of ours"
