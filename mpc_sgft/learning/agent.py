@@ -84,8 +84,6 @@ class Agent:
         }
         self.products = dtype_of_products(precision, int(model.sizes["mlp_dim"]), self.device)
         self.generator = torch.Generator(self.device).manual_seed(seed)
-        on_host = self.device.type == "cpu"
-        self._host_generator = self.generator if on_host else torch.Generator().manual_seed(seed)
         self.scale = losses.RunningScale(scale_rate, self.device)
         self.log_entropy_coef = torch.tensor(entropy_coef, device=self.device).log().requires_grad_()
         self._averaged = AveragedWeights(self.model, average_decay)
@@ -321,7 +319,6 @@ class Agent:
             "snapshot": self.snapshot(),
             "updates": self.updates,
             "generator": self.generator.get_state(),
-            "host_generator": self._host_generator.get_state(),
             "torch_rng": torch.get_rng_state(),
             "cuda_rng": torch.cuda.get_rng_state(self.device) if self.device.type == "cuda" else None,
         }
@@ -340,7 +337,6 @@ class Agent:
         self.restore(state["snapshot"])
         self.updates = state["updates"]
         self.generator.set_state(state["generator"].cpu())
-        self._host_generator.set_state(state["host_generator"].cpu())
         torch.set_rng_state(state["torch_rng"].cpu())
         if state["cuda_rng"] is not None and self.device.type == "cuda":
             torch.cuda.set_rng_state(state["cuda_rng"].cpu(), self.device)
@@ -397,4 +393,4 @@ class Agent:
             return None
         if self.device.type == "cuda":  # the host is not asked
             return torch.rand(self.model.num_q, generator=self.generator, device=self.device).argsort()[:2]
-        return torch.randperm(self.model.num_q, generator=self._host_generator)[:2].tolist()
+        return torch.randperm(self.model.num_q, generator=self.generator)[:2].tolist()

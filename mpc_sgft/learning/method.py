@@ -37,6 +37,7 @@ class AbstractMethod(ABC):
         action_noise: Standard deviation of the noise on real actions, action units.
         gate: When fine-tuned parts may act; None: at once.
         average_decay: Of the averaged weights that are tested and act, per update; 0: the last ones.
+        terminal: What plans end in, as `WorldModel` has it.
         policy_share: Of the way from the pretrained policy prior to the fine-tuned one that acts.
     """
 
@@ -46,6 +47,7 @@ class AbstractMethod(ABC):
     gate: Gate | None = None
     average_decay: float = 0.0
     policy_share: float = 1.0
+    terminal: str = "value"
 
     @abstractmethod
     def take_over(self, agent: Agent, sensed: Sensed) -> None:

@@ -49,6 +49,7 @@ class Transfer:
         self, agent: Agent, method: AbstractMethod, sensed: Sensed, *, capacity: int, batch_size: int, seed: int
     ):
         self.agent, self.method, self.slice_len = agent, method, method.slice_len
+        agent.model.sizes["terminal"] = method.terminal  # whatever the checkpoint was last used with
         method.take_over(agent, sensed)
         sizes = {"capacity": capacity, "slice_len": method.slice_len, "batch_size": batch_size}
         self._new_buffer = partial(make_buffer, **sizes, seed=seed, device=agent.device)

@@ -51,9 +51,9 @@ class SGFTSAC(AbstractMethod):
         updates: int,
         action_noise: float,
     ):
+        if slice_len < 1 or branches < 0:
+            raise ValueError(f"slice_len={slice_len} must be 1 or more, and branches={branches} 0 or more.")
         check_objective(slice_len, rho)
-        if branches < 0:
-            raise ValueError(f"branches={branches} must be 0 or more.")
         self.slice_len, self.branches, self.rho = slice_len, branches, rho
         self.lr, self.policy_lr, self.entropy_coef = lr, policy_lr, entropy_coef
         self.updates, self.action_noise = updates, action_noise

@@ -53,7 +53,6 @@ class TDMPC2(AbstractMethod):
         self.updates, self.slice_len, self.action_noise = updates, slice_len, action_noise
 
     def take_over(self, agent: Agent, sensed: Sensed) -> None:
-        agent.model.sizes["terminal"] = self.terminal
         parts = PRETRAINED
         if self.command_map:
             if agent.model.dynamics.command is None:

@@ -30,7 +30,19 @@ from planners.mppi import MPPI
 from tools.benchmarks.time_planner import ROOT, SEARCH, UPSTREAM, cpu_name, random_batch
 from tools.studies.runner import write
 
-COLUMNS = ["what", "size", "precision", "recorded", "count", "median_ms", "per_second", "success", "device", "torch"]
+COLUMNS = [
+    "what",
+    "size",
+    "precision",
+    "recorded",
+    "count",
+    "median_ms",
+    "per_second",
+    "success",
+    "parts_s",
+    "device",
+    "torch",
+]
 UPDATES = 20  # of which the last is read
 SETTLED = 4  # calls that are not counted: the first ones compile, and record
 
@@ -88,7 +100,8 @@ def pretraining(device: torch.device, folder: Path, settings: list[str]) -> dict
     subprocess.run([sys.executable, "-m", "mpc_sgft.pretrain", *words], check=True)
     done = json.loads((folder / "summary.json").read_text())
     row = {"what": "pretrain push", "size": "small", "precision": "auto", "count": done["transitions"]}
-    return row | {"median_ms": round(1e3 * done["wall_seconds"]), "success": done["success"]}
+    parts = ", ".join(f"{part} {spent}" for part, spent in done["seconds"].items())
+    return row | {"median_ms": round(1e3 * done["wall_seconds"]), "success": done["success"], "parts_s": parts}
 
 
 def main(arguments: list[str] | None = None) -> int:

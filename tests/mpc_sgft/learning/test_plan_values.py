@@ -12,6 +12,7 @@ from mpc_sgft.learning import precision
 from mpc_sgft.learning.world_model import WorldModel
 from planners.base import h_step_return
 from planners.mppi import MPPI
+from tests.host_reads import NoWaiting
 
 CPU = torch.device("cpu")
 
@@ -72,6 +73,17 @@ def test_bfloat16_orders_plans_as_float32_does() -> None:
     error = (rounded - exact).std(1) / exact.std(1)
     assert 1e-5 < error.min() and error.max() < 0.05  # rounded, and by little beside what tells plans apart
     assert rounded.dtype == torch.float32
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("terminal", ["value", "q"])
+def test_the_host_waits_for_no_search_with_a_world_model(terminal: str) -> None:
+    model = model_with(memory=6, command=True, residual=True)
+    model.sizes["terminal"] = terminal
+    planner = MPPI(action_dim=2, num_candidates=64, num_prior=8, num_elites=32, iterations=3)
+    z = model.encode(torch.randn(2, 14))
+    with NoWaiting():
+        planner._search(model, True, True, torch.Generator().manual_seed(0), z, torch.zeros(2, 4, 2))
 
 
 def test_a_plan_does_not_depend_on_the_way_to_its_values() -> None:

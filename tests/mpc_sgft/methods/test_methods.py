@@ -10,6 +10,7 @@ from hydra.utils import instantiate
 from tensordict import TensorDict
 
 from mpc_sgft.command import choices, compose
+from mpc_sgft.command.errors import UserError
 from mpc_sgft.learning.agent import Agent
 from mpc_sgft.learning.method import AbstractMethod
 from mpc_sgft.learning.observation_map import Sensed
@@ -100,6 +101,20 @@ def test_a_method_brings_its_planner_and_the_command_line_wins() -> None:
     assert elites("method=sgft_paper") == 16 < elites()
     assert elites("method=sgft_paper", "planner=cem") == 64
     assert elites("method=sgft_paper", "planner.num_elites=32") == 32
+
+
+def test_plans_end_in_what_the_method_says_whatever_the_checkpoint_was_last_used_with() -> None:
+    t = make("method=tdmpc2", "method.terminal=q")
+    assert {x.sizes["terminal"] for x in (t.agent.model, t.acting, t.pretrained)} == {"q"}
+    sensed = Sensed(("tip_x", "tip_y"), torch.zeros(2, 2))
+    again = Transfer(t.agent, make("method=sgft").method, sensed, capacity=100, batch_size=4, seed=0)
+    assert again.acting.sizes["terminal"] == "value"
+
+
+@pytest.mark.parametrize("bad", ["slice_len=0", "branches=-1", "rho=0"])
+def test_numbers_of_dyna_sgft_out_of_range_are_refused_with_their_name(bad: str) -> None:
+    with pytest.raises(UserError, match=bad):
+        make("method=sgft_sac", f"method.{bad}")
 
 
 def test_sgft_as_published_learns_the_reward() -> None:
