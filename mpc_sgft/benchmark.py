@@ -131,7 +131,8 @@ def evaluate(name: str, act: Callable[[Floats], NDArray[Any]], *, episodes: int 
 
 
 def _env(task: str, gap: str, num_envs: int, *, randomised: bool = False) -> ControlEnv:
-    return build.make_env(compose("evaluate", [f"task={task}", f"gap={gap}"], []), num_envs, randomised=randomised)
+    words = [f"task={task}", f"gap={gap}", f"randomize={task if randomised else 'none'}"]
+    return build.make_env(compose("evaluate", words, []), num_envs, randomised=randomised)
 
 
 def _register() -> None:

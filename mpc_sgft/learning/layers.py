@@ -18,6 +18,7 @@ from torch import Tensor, nn
 
 _ONE = torch.ones(())
 LOGIT_LIMIT = 80.0  # e^80 is still a finite float32; LayerNorm keeps logits of SimNorm far below
+WITHIN = 0.999  # of the box of actions [-1, 1]: where one at its edge is taken to lie
 BLOCK_ROWS = 1024  # rows of one pass in inference on a CPU: intermediate results stay in its second-level cache
 
 
@@ -387,3 +388,18 @@ def gaussian_tanh(mean: Tensor, log_std: Tensor, noise: Tensor) -> tuple[Tensor,
     log_normal = -0.5 * noise**2 - log_std - 0.5 * math.log(2 * math.pi)
     correction = 2 * (math.log(2) - u - F.softplus(-2 * u))
     return torch.tanh(u), (log_normal - correction).sum(-1)
+
+
+def gaussian_tanh_log_prob(mean: Tensor, log_std: Tensor, action: Tensor) -> Tensor:
+    """Log-density that a squashed Gaussian gives to an action.
+
+    An action at the edge of the box would lie at infinity before it is squashed: it counts as just within.
+
+    Args:
+        mean, log_std, action: [..., A]; action in [-1, 1].
+
+    Returns:
+        Log-density, [...].
+    """
+    u = torch.atanh(action.clamp(-WITHIN, WITHIN))
+    return gaussian_tanh(mean, log_std, (u - mean) / log_std.exp())[1]

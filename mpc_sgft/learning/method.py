@@ -39,6 +39,8 @@ class AbstractMethod(ABC):
         average_decay: Of the averaged weights that are tested and act, per update; 0: the last ones.
         terminal: What plans end in, as `WorldModel` has it.
         policy_share: Of the way from the pretrained policy prior to the fine-tuned one that acts.
+        simulated_episodes: Of the pretrained policy in the randomised simulator, exploring as in pretraining; half of
+            each batch is from these then. 0: real data alone.
     """
 
     updates: int
@@ -48,6 +50,7 @@ class AbstractMethod(ABC):
     average_decay: float = 0.0
     policy_share: float = 1.0
     terminal: str = "value"
+    simulated_episodes: int = 0
 
     @abstractmethod
     def take_over(self, agent: Agent, sensed: Sensed) -> None:
@@ -60,7 +63,7 @@ class AbstractMethod(ABC):
 
     @abstractmethod
     def update(self, agent: Agent, batch: TensorDictBase, *, starts: Tensor) -> dict:
-        """One step on slices [B, T] of real data; returns metrics, {name: float}.
+        """One step on slices [B, T], real ones first; returns metrics, {name: float}.
 
         Args:
             agent: That this method took over.

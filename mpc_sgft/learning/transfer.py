@@ -16,7 +16,7 @@ from functools import partial
 from typing import NamedTuple
 
 import torch
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
 
 from mpc_sgft.learning.agent import Agent
 from mpc_sgft.learning.averaged import AveragedWeights
@@ -43,16 +43,36 @@ class Transfer:
         capacity: Real transitions to hold.
         batch_size, seed: Of the replay slices.
         sensed: As in `AbstractMethod.take_over`.
+        simulated: Gives as many simulated episodes [N, T] as it is asked for; only methods that learn from some ask.
+
+    Raises:
+        ValueError: If simulated episodes are wanted and there is nothing that makes them.
     """
 
     def __init__(
-        self, agent: Agent, method: AbstractMethod, sensed: Sensed, *, capacity: int, batch_size: int, seed: int
+        self,
+        agent: Agent,
+        method: AbstractMethod,
+        sensed: Sensed,
+        *,
+        capacity: int,
+        batch_size: int,
+        seed: int,
+        simulated: Callable[[int], TensorDict] | None = None,
     ):
         self.agent, self.method, self.slice_len = agent, method, method.slice_len
         agent.model.sizes["terminal"] = method.terminal  # whatever the checkpoint was last used with
+        self.simulated = None
+        sizes = {"slice_len": method.slice_len, "batch_size": batch_size, "seed": seed, "device": agent.device}
+        if method.simulated_episodes:
+            if simulated is None:
+                raise ValueError(f"{type(method).__name__} learns from simulated episodes: give what makes them.")
+            steps = simulated(method.simulated_episodes)  # before the method changes anything
+            sizes["batch_size"] = batch_size // 2
+            self.simulated = make_buffer(steps.numel(), **sizes)
+            self.simulated.extend(steps)
         method.take_over(agent, sensed)
-        sizes = {"capacity": capacity, "slice_len": method.slice_len, "batch_size": batch_size}
-        self._new_buffer = partial(make_buffer, **sizes, seed=seed, device=agent.device)
+        self._new_buffer = partial(make_buffer, capacity, **sizes)
         self.buffer = self._new_buffer()
         self.pretrained = copy.deepcopy(agent.model)
         self.averaged = AveragedWeights(agent.model, method.average_decay)
@@ -85,10 +105,15 @@ class Transfer:
         self.starts.append(steps["observation"][0].to(self.agent.device))
         starts, metrics = torch.stack(self.starts), dict[str, float]()
         for _ in track(range(self.method.updates)):
-            metrics = self.method.update(self.agent, self.buffer.sample(), starts=starts)
+            metrics = self.method.update(self.agent, self.batch(), starts=starts)
             self.averaged.follow(self.agent.model)
         self._hand_over(verdict.accepted)
         return metrics | {"error_pretrained": verdict.pretrained, "error_fine_tuned": verdict.fine_tuned}
+
+    def batch(self) -> TensorDictBase:
+        """What an update learns from, [B, T]: real slices, and as many simulated ones if the method wants them."""
+        real = self.buffer.sample()
+        return real if self.simulated is None else torch.cat([real, self.simulated.sample()])
 
     @torch.no_grad()
     def _hand_over(self, accepted: bool) -> None:
@@ -101,6 +126,7 @@ class Transfer:
             "agent": self.agent.state_dict(),
             "method": self.method.state_dict(),
             "buffer": self.buffer.state_dict(),
+            "simulated": self.simulated and self.simulated.state_dict(),
             "averaged": self.averaged.state_dict(),
             "acting": self.acting.state_dict(),
             "starts": [x.clone() for x in self.starts],
@@ -112,6 +138,8 @@ class Transfer:
         self.method.load_state_dict(state["method"])
         self.buffer = self._new_buffer()  # what is loaded may hold less than what is there
         self.buffer.load_state_dict(state["buffer"])
+        if self.simulated is not None:
+            self.simulated.load_state_dict(state["simulated"])
         self.averaged.load_state_dict(state["averaged"])
         self.acting.load_state_dict(state["acting"])
         self.starts = [x.to(self.agent.device) for x in state["starts"]]

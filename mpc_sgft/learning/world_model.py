@@ -13,7 +13,16 @@ import torch
 from torch import Tensor, nn
 
 from mpc_sgft.learning.dynamics import Dynamics
-from mpc_sgft.learning.layers import Ensemble, Normalizer, SimNorm, TwoHot, by_blocks, gaussian_tanh, mlp
+from mpc_sgft.learning.layers import (
+    Ensemble,
+    Normalizer,
+    SimNorm,
+    TwoHot,
+    by_blocks,
+    gaussian_tanh,
+    gaussian_tanh_log_prob,
+    mlp,
+)
 from mpc_sgft.learning.observation_map import ObservationMap
 from mpc_sgft.learning.plan_values import PlanValues, PlanWeights
 from mpc_sgft.learning.precision import dtype_of_products
@@ -189,6 +198,10 @@ class WorldModel(nn.Module):
     def policy(self, z: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
         """Reparameterised action [..., A] and its exact log-density [...]; noise is standard normal [..., A]."""
         return gaussian_tanh(*self._policy_moments(z), noise)
+
+    def log_prob(self, z: Tensor, action: Tensor) -> Tensor:
+        """Log-density of an action [..., A] under the policy, [...]."""
+        return gaussian_tanh_log_prob(*self._policy_moments(z), action)
 
     def _policy_moments(self, z: Tensor) -> tuple[Tensor, Tensor]:
         mean, log_std = by_blocks(self.policy_head, z).chunk(2, -1)

@@ -2,12 +2,15 @@
 
 import json
 import time
+from collections.abc import Callable
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from hydra.utils import instantiate
 from omegaconf import DictConfig
+from tensordict import TensorDict
 
 from envs.backends.base import BackendError
 from envs.env import ControlEnv
@@ -18,6 +21,7 @@ from mpc_sgft.learning.observation_map import Sensed
 from mpc_sgft.learning.transfer import Transfer, open_loop_error
 from mpc_sgft.runs import build, robot
 from mpc_sgft.runs.collect import Score, collect, planner_policy, score, score_of
+from mpc_sgft.runs.explore import explored
 from mpc_sgft.runs.pretrain import EVAL_SEED, StopRequest
 from mpc_sgft.runs.real_rollout import begin, drive, start_seed
 from mpc_sgft.session import person
@@ -59,8 +63,14 @@ def deploy(cfg: DictConfig) -> int:
     return 0
 
 
-def make_transfer(cfg: DictConfig, agent: Agent, sensed: Sensed, episode_steps: int) -> Transfer:
-    """A pretrained agent in the hands of `cfg.method`.
+def make_transfer(
+    cfg: DictConfig,
+    agent: Agent,
+    sensed: Sensed,
+    episode_steps: int,
+    simulated: Callable[[int], TensorDict] | None = None,
+) -> Transfer:
+    """A pretrained agent in the hands of `cfg.method`; simulated episodes are those of pretraining, if not given.
 
     Raises:
         UserError: For a number that the method refuses.
@@ -74,6 +84,7 @@ def make_transfer(cfg: DictConfig, agent: Agent, sensed: Sensed, episode_steps: 
         capacity=(cfg.rollouts + 1) * episode_steps,
         batch_size=cfg.train.replay.batch_size,
         seed=cfg.seed,
+        simulated=simulated or partial(explored, cfg.seed, build.agents_of(cfg), agent.model),
     )
 
 

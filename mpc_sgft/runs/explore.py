@@ -1,6 +1,7 @@
 """A round of exploration in simulation, as a function of its number and of the policy: the same wherever it runs."""
 
 from collections.abc import Mapping
+from contextlib import closing
 from typing import Any, NamedTuple
 
 import torch
@@ -8,6 +9,7 @@ from omegaconf import DictConfig
 from tensordict import TensorDict
 from torch import Tensor
 
+from mpc_sgft.command.compose import compose
 from mpc_sgft.learning.world_model import WorldModel
 from mpc_sgft.runs import build
 from mpc_sgft.runs.collect import Act, collect, planner_policy, random_policy
@@ -73,6 +75,21 @@ class Explorer:
             act = explorer(self.model, self.cfg, self.env.batch_size[0], seed)
         steps = collect(self.env, act, seed=seed)
         return Collected(steps, self.env.backend.counters["unstable"] - before)
+
+
+def explored(seed: int, task: str, model: WorldModel, episodes: int) -> TensorDict:
+    """Episodes [N, T] of a pretrained policy that explores in the randomised simulator as it did in pretraining.
+
+    Args:
+        seed: Of the draws and of the noise.
+        task: Whose simulator.
+        model: The policy.
+        episodes: N.
+    """
+    cfg = compose("pretrain", [f"task={task}", f"num_envs={episodes}", f"seed={seed}"], [])
+    worker = Explorer(cfg, dict(model.sizes))
+    with closing(worker.env.backend):
+        return worker.collect(Round(0, policy_weights(model))).steps
 
 
 def share(count: int, part: int, parts: int) -> int:

@@ -5,6 +5,7 @@ from pathlib import Path
 import gymnasium
 import numpy as np
 import pytest
+import torch
 from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
 
@@ -14,6 +15,7 @@ from mpc_sgft.command import choices
 from mpc_sgft.command.compose import compose
 from mpc_sgft.command.errors import UserError
 from mpc_sgft.runs import build
+from mpc_sgft.runs.pretrain import prior
 from mpc_sgft.runs.real_rollout import begin, start_seed
 
 STILL = np.zeros(2, np.float32)
@@ -71,6 +73,18 @@ def test_gymnasium_checks_the_simulator() -> None:
     check_env(benchmark.simulated("push"))
 
 
+def test_the_simulator_is_drawn_anew_each_episode() -> None:
+    env = gymnasium.make("mpc_sgft/push-sim-v0").unwrapped
+    masses = []
+    for _ in range(3):
+        env.reset()
+        masses.append(env.env.backend.randomizer.arrays["body_mass"][0].copy())
+    assert len({mass.tobytes() for mass in masses}) == 3
+    env = RealRollouts("push", "turned")
+    env.reset()
+    assert not env.env.backend.randomizer.arrays, "there is one reality"
+
+
 def test_a_policy_that_knows_the_gap_scores_and_one_that_does_not_fails() -> None:
     task = build.make_env(compose("evaluate", [], []), 1).task
 
@@ -84,7 +98,13 @@ def test_a_policy_that_knows_the_gap_scores_and_one_that_does_not_fails() -> Non
     name = "mpc_sgft/push-turned-v0"
     assert benchmark.evaluate(name, scripted, episodes=16).success < 0.3
     assert benchmark.evaluate(name, turned_back, episodes=16).success > 0.7
-    assert benchmark.evaluate("mpc_sgft/push-sim-v0", scripted, episodes=16).success > 0.9
+    assert benchmark.evaluate("mpc_sgft/push-sim-v0", scripted, episodes=16).success < 0.5, "it knows no delays"
+    pretrained = prior(build.load_agent(compose("evaluate", [], []))[0])
+
+    def trained(observation: np.ndarray) -> np.ndarray:
+        return pretrained(torch.from_numpy(observation), torch.ones(len(observation), dtype=torch.bool)).numpy()
+
+    assert benchmark.evaluate("mpc_sgft/push-sim-v0", trained, episodes=16).success > 0.9
 
 
 def test_another_name_is_refused() -> None:

@@ -17,6 +17,7 @@ from mpc_sgft.learning.layers import (
     by_blocks,
     dropout,
     gaussian_tanh,
+    gaussian_tanh_log_prob,
     mish,
     mlp,
     products_in,
@@ -118,6 +119,17 @@ def test_gaussian_tanh_log_density_against_torch_distributions():
     normal = torch.distributions.Normal(mean, log_std.exp())
     squashed = torch.distributions.TransformedDistribution(normal, torch.distributions.TanhTransform())
     assert_close(log_prob, squashed.log_prob(action).sum(-1))
+
+
+def test_log_density_of_an_action_is_that_of_its_sample_and_finite_at_the_edge():
+    generator = torch.Generator().manual_seed(0)
+    mean, log_std, noise = (0.3 * torch.randn(50, 3, generator=generator, dtype=torch.float64) for _ in range(3))
+    action, log_prob = gaussian_tanh(mean, log_std, noise)
+    assert action.abs().max() < 0.99
+    assert_close(gaussian_tanh_log_prob(mean, log_std, action), log_prob)
+    edge = torch.tensor([[1.0, -1.0, 1.0]], dtype=torch.float64)
+    assert_close(gaussian_tanh_log_prob(mean, log_std, edge), gaussian_tanh_log_prob(mean, log_std, 0.999 * edge))
+    assert gaussian_tanh_log_prob(mean, log_std, edge).isfinite().all()
 
 
 def test_gaussian_tanh_density_integrates_to_one():

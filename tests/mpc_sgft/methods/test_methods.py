@@ -42,7 +42,11 @@ def make(*overrides: str, device: str = "cpu") -> Transfer:
     cfg = compose.compose("deploy", [compose.normalise(text) for text in given], given)
     torch.manual_seed(0)
     agent: Agent = instantiate(cfg.train.agent, model=WorldModel(**SIZES), seed=0, device=device, discount=0.9)
-    return make_transfer(cfg, agent, Sensed(("tip_x", "tip_y"), torch.zeros(2, 2)), 12)
+    return make_transfer(cfg, agent, Sensed(("tip_x", "tip_y"), torch.zeros(2, 2)), 12, simulated)
+
+
+def simulated(episodes: int) -> TensorDict:
+    return torch.stack([rollout(1000 + seed) for seed in range(min(episodes, 4))])
 
 
 def test_every_file_is_a_method_and_every_method_has_its_numbers():
@@ -109,6 +113,21 @@ def test_plans_end_in_what_the_method_says_whatever_the_checkpoint_was_last_used
     sensed = Sensed(("tip_x", "tip_y"), torch.zeros(2, 2))
     again = Transfer(t.agent, make("method=sgft").method, sensed, capacity=100, batch_size=4, seed=0)
     assert again.acting.sizes["terminal"] == "value"
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_half_of_each_batch_is_simulated_where_a_method_says_so(name: str) -> None:
+    t = make(f"method={name}")
+    t.buffer.extend(rollout(0))
+    real = t.batch()["episode"] < 1000
+    wanted = 8 if name in ("rlpd", "iql") else 16
+    assert len(real) == 16 and real[:wanted].all() and not real[wanted:].any()
+
+
+@pytest.mark.parametrize("bad", ["expectile=0.5", "expectile=1", "temperature=0"])
+def test_numbers_of_implicit_q_learning_out_of_range_are_refused_with_their_name(bad: str) -> None:
+    with pytest.raises(UserError, match=bad.split("=")[0]):
+        make("method=iql", f"method.{bad}")
 
 
 @pytest.mark.parametrize("bad", ["slice_len=0", "branches=-1", "rho=0"])
