@@ -26,6 +26,9 @@ from mpc_sgft.learning.observation_map import Sensed
 from mpc_sgft.learning.world_model import WorldModel
 
 
+SHARED = "observation", "action", "episode", "step", *(("next", k) for k in ("observation", "reward", "terminated"))
+
+
 class Verdict(NamedTuple):
     """How the dynamics predicted a rollout that nobody had trained on."""
 
@@ -112,8 +115,9 @@ class Transfer:
 
     def batch(self) -> TensorDictBase:
         """What an update learns from, [B, T]: real slices, and as many simulated ones if the method wants them."""
-        real = self.buffer.sample()
-        return real if self.simulated is None else torch.cat([real, self.simulated.sample()])
+        if self.simulated is None:
+            return self.buffer.sample()
+        return torch.cat([buffer.sample().select(*SHARED) for buffer in (self.buffer, self.simulated)])
 
     @torch.no_grad()
     def _hand_over(self, accepted: bool) -> None:

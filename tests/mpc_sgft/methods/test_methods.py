@@ -46,7 +46,9 @@ def make(*overrides: str, device: str = "cpu") -> Transfer:
 
 
 def simulated(episodes: int) -> TensorDict:
-    return torch.stack([rollout(1000 + seed) for seed in range(min(episodes, 4))])
+    """Not every entry of a simulated step is there in a real one."""
+    steps = torch.stack([rollout(1000 + seed) for seed in range(min(episodes, 4))])
+    return steps.set("action_sent", steps["action"])
 
 
 def test_every_file_is_a_method_and_every_method_has_its_numbers():
