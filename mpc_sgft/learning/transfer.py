@@ -13,7 +13,7 @@ import copy
 import math
 from collections.abc import Callable, Iterable
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -24,7 +24,6 @@ from mpc_sgft.learning.buffer import make_buffer
 from mpc_sgft.learning.method import AbstractMethod
 from mpc_sgft.learning.observation_map import Sensed
 from mpc_sgft.learning.world_model import WorldModel
-
 
 SHARED = "observation", "action", "episode", "step", *(("next", k) for k in ("observation", "reward", "terminated"))
 
@@ -117,7 +116,8 @@ class Transfer:
         """What an update learns from, [B, T]: real slices, and as many simulated ones if the method wants them."""
         if self.simulated is None:
             return self.buffer.sample()
-        return torch.cat([buffer.sample().select(*SHARED) for buffer in (self.buffer, self.simulated)])
+        parts = [buffer.sample().select(*SHARED) for buffer in (self.buffer, self.simulated)]
+        return cast(TensorDictBase, TensorDict.cat(parts))
 
     @torch.no_grad()
     def _hand_over(self, accepted: bool) -> None:

@@ -104,6 +104,7 @@ class Deployment:
         self.frozen = agent.frozen_hash()
         self.state: dict[str, Any] = {"rollouts": 0, "aborted": 0, "scores": {}, "seconds": 0.0, "successes": 0}
         self.state |= {"interventions": 0, "rerecorded": 0}
+        self.state["updates"] = 0
         self.state["outcomes"] = []  # (success, return) of each real rollout
         if cfg.resume is not None:
             self._resume()
@@ -159,6 +160,7 @@ class Deployment:
         if len(valid) >= self.transfer.slice_len and not rollout.intervened:
             self.operator.enter("training", number)
             metrics |= self.transfer.learn(valid, self.operator.track)
+            self.state["updates"] += self.transfer.method.updates
         self.state["rollouts"] = number
         self.state["aborted"] += rollout.aborted is not None
         self.state["interventions"] += rollout.intervened
@@ -309,6 +311,7 @@ class Deployment:
             "aborted_rollouts": self.state["aborted"],
             "interventions": self.state["interventions"],
             "rerecorded": self.state["rerecorded"],
+            "updates": self.state["updates"],
             "zero_shot_success": scores[0]["success"] if 0 in scores else None,
             "final_success": scores[max(scores)]["success"],
             "final_interval": [scores[max(scores)]["success_low"], scores[max(scores)]["success_high"]],

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from envs.env import ControlEnv
+from envs.task import ValuePlane
 from mpc_sgft.learning.world_model import WorldModel
 from mpc_sgft.storage.rollout import Rollout
 from mpc_sgft.views.blueprint import Layout
@@ -78,12 +79,7 @@ class DeployViewer:
         plane = self.task.value_plane(GRID)
         if plane is None:
             return
-        still = np.tile(plane.observation, (1, self.env.history + 1))
-        past = np.zeros((len(still), self.env.obs_dim - still.shape[1]))
-        observation = torch.from_numpy(np.concatenate([still, past], 1)).float()
-        with torch.inference_mode():
-            values = model.terminal_value(model.encode(observation.to(next(model.parameters()).device)))
-        grid = values.cpu().numpy().reshape(plane.shape)
+        grid = values_on(plane, model, self.env.history)
         self.limits = self.limits or (float(grid.min()), float(grid.max()))
         self.viewer.value_map(name, grid, plane.extent, marks=plane.marks, limits=self.limits, axes=plane.axes)
 
@@ -103,6 +99,16 @@ class DeployViewer:
         with torch.inference_mode():
             latents = imagine(model, model.encode(observation.to(device)), plans.to(device))
             return self._points(model.decode(latents).cpu())
+
+
+@torch.inference_mode()
+def values_on(plane: ValuePlane, model: WorldModel, history: int) -> np.ndarray:
+    """V over a plane, at rest with no commands behind it, as large as the plane's grid."""
+    still = np.tile(plane.observation, (1, history + 1))
+    past = np.zeros((len(still), model.obs_dim - still.shape[1]))
+    observation = torch.from_numpy(np.concatenate([still, past], 1)).float()
+    values = model.terminal_value(model.encode(observation.to(next(model.parameters()).device)))
+    return values.cpu().numpy().reshape(plane.shape)
 
 
 def _realised(model: WorldModel, following, reward: np.ndarray, horizon: int, discount: float) -> np.ndarray:

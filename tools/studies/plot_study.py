@@ -15,19 +15,30 @@ import matplotlib
 matplotlib.use("agg")
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.axes import Axes
 from scipy.stats import bootstrap
 
-COLOURS = {"sgft": "#1f77b4", "tdmpc2": "#d62728"}
+COLOURS = {  # of a method in every figure
+    "sgft": "#1f77b4",
+    "sgft_paper": "#17becf",
+    "sgft_sac": "#2ca02c",
+    "pbrs": "#9467bd",
+    "tdmpc2": "#d62728",
+    "sac": "#ff7f0e",
+    "rlpd": "#8c564b",
+    "iql": "#7f7f7f",
+}
+Curves = dict[str, dict[str, dict[int, list[float]]]]  # gap -> label -> rollouts -> of each seed
 
 
-def read(paths: list[Path]) -> dict[str, dict[str, dict[int, list[float]]]]:
-    """gap -> label -> rollouts -> success of each seed."""
-    curves: dict = defaultdict(lambda: defaultdict(lambda: defaultdict(list)))
+def read(paths: list[Path], column: str = "success") -> Curves:
+    """Success, or another column, of each seed."""
+    curves: Curves = defaultdict(lambda: defaultdict(lambda: defaultdict(list)))
     for path in paths:
         with path.open() as file:
             for row in csv.DictReader(file):
                 label = " ".join(x for x in (row["method"], row["variant"]) if x)
-                curves[row["gap"]][label][int(row["rollouts"])].append(float(row["success"]))
+                curves[row["gap"]][label][int(row["rollouts"])].append(float(row[column]))
     return curves
 
 
@@ -39,6 +50,20 @@ def interval(values: list[float]) -> tuple[float, float]:
     return found.confidence_interval
 
 
+def panel(axis: Axes, title: str, lines: dict[str, dict[int, list[float]]]) -> None:
+    """Mean over the seeds by real rollouts, and its interval, a line a label."""
+    for label, points in lines.items():
+        x = sorted(points)
+        mean = [np.mean(points[k]) for k in x]
+        low, high = zip(*(interval(points[k]) for k in x), strict=True)
+        seeds = f"{label}, seeds: {len(points[x[0]])}"
+        (line,) = axis.plot(x, mean, marker="o", markersize=3, label=seeds, color=COLOURS.get(label))
+        axis.fill_between(x, low, high, alpha=0.2, color=line.get_color())
+    axis.set(title=title, xlabel="real rollouts")
+    axis.grid(alpha=0.3)
+    axis.legend(frameon=False, fontsize="small")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("csv", type=Path, nargs="+")
@@ -47,18 +72,8 @@ def main() -> None:
     curves = read(args.csv)
     figure, axes = plt.subplots(1, len(curves), figsize=(4.2 * len(curves), 3.4), sharey=True, squeeze=False)
     for axis, (gap, methods) in zip(axes[0], curves.items(), strict=True):
-        for label, points in methods.items():
-            x = sorted(points)
-            mean = [np.mean(points[k]) for k in x]
-            low, high = zip(*(interval(points[k]) for k in x), strict=True)
-            colour = COLOURS.get(label)
-            (line,) = axis.plot(
-                x, mean, marker="o", markersize=3, label=f"{label}, seeds: {len(points[x[0]])}", color=colour
-            )
-            axis.fill_between(x, low, high, alpha=0.2, color=line.get_color())
-        axis.set(title=f"gap: {gap}", xlabel="real rollouts", ylim=(-0.02, 1.02))
-        axis.grid(alpha=0.3)
-        axis.legend(frameon=False)
+        panel(axis, f"gap: {gap}", methods)
+        axis.set_ylim(-0.02, 1.02)
     axes[0][0].set_ylabel("success, mean and 95 % bootstrap")
     figure.tight_layout()
     args.png.parent.mkdir(parents=True, exist_ok=True)

@@ -16,12 +16,12 @@ from pathlib import Path
 from tools.studies.runner import each, finished, first_mean, write
 
 COLUMNS = ["gap", "method", "variant", "seed", "rollouts", "success", "return", "episodes", "audit", "frozen_sha256"]
+COLUMNS += ["updates", "seconds"]
 AUDITED = 5  # rollouts, the first, whose mean improvability share stands in each row as `audit`
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("csv", type=Path)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """What is run, and how; the CSV is not among them."""
     parser.add_argument("--gaps", nargs="+", required=True)
     parser.add_argument("--methods", nargs="+", default=["sgft"])
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
@@ -37,16 +37,17 @@ def main() -> None:
     parser.add_argument(
         "--launcher", help="Hydra launcher of the runs, e.g. submitit_slurm; its settings go into --set"
     )
-    args = parser.parse_args()
+
+
+def run(path: Path, args: argparse.Namespace) -> None:
+    """Run what is not there yet, and write the learning curves of all to a CSV; exits if some failed."""
     jobs = list(itertools.product(args.seeds, args.gaps, args.methods, args.variants))
 
     def work(job: tuple[int, str, str, str]) -> dict:
         seed, gap, method, variant = job
         checkpoint = args.checkpoints[seed % len(args.checkpoints)]
         label = "-".join(
-            str(x).translate(str.maketrans("/= ", "__+"))
-            for x in (args.csv.stem, gap, method, variant, seed)
-            if x != ""
+            str(x).translate(str.maketrans("/= ", "__+")) for x in (path.stem, gap, method, variant, seed) if x != ""
         )
         words = [f"gap={gap}", f"method={method}", f"seed={seed}", "log.rerun=false"]
         words += variant.split()
@@ -66,13 +67,22 @@ def main() -> None:
             "return": r.get("return_curve", {}).get(k),  # runs of earlier versions did not say it
             "episodes": r["evaluation_episodes"],
             "frozen_sha256": r["frozen_sha256"][:12],
+            "seconds": r["wall_seconds"],
         }
         for r in results
         for k, s in r["curve"].items()
     ]
-    write(args.csv, COLUMNS, rows)
+    write(path, COLUMNS, rows)
     if failed:
         sys.exit(f"{failed} of {len(jobs)} runs failed")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("csv", type=Path)
+    add_arguments(parser)
+    args = parser.parse_args()
+    run(args.csv, args)
 
 
 if __name__ == "__main__":

@@ -97,6 +97,8 @@ def test_the_summary_holds_what_scripts_read(deployed):
     summary = json.loads((deployed / "summary.json").read_text())
     assert set(NEEDED) <= set(summary)
     assert summary["real_rollouts"] == 4 and summary["gap"] == "pendulum_torque"
+    config = OmegaConf.load(deployed / "config.yaml")
+    assert summary["updates"] == 4 * config.method.updates > 0
     assert len(list((deployed / "episodes").glob("*.mcap"))) == 4
     told = {row["step"]: float(row["return"]) for row in rows(deployed) if row["return"]}
     returns = summary["return_curve"]

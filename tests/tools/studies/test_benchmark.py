@@ -1,0 +1,77 @@
+"""Scores of methods from curves: by hand, and as the library has them."""
+
+import csv
+from pathlib import Path
+
+import pytest
+
+from tools.studies import benchmark
+from tools.studies.study import COLUMNS
+
+pytest.importorskip("rliable", reason="needs rliable")
+
+
+def curve(path: Path, runs: dict[tuple[str, str, int], dict[int, float]]) -> Path:
+    """A CSV as tools.studies.study writes it: (gap, method, seed) -> rollouts -> success."""
+    with path.open("w", newline="") as file:
+        table = csv.DictWriter(file, COLUMNS, restval="")
+        table.writeheader()
+        for (gap, method, seed), success in runs.items():
+            for count, share in success.items():
+                row = {"gap": gap, "method": method, "seed": seed, "rollouts": count, "success": share}
+                table.writerow({**row, "updates": 100, "seconds": 7.5})
+    return path
+
+
+@pytest.fixture
+def curves(tmp_path) -> Path:
+    runs = {}
+    for seed in range(4):
+        for gap in ("a", "b"):
+            runs[gap, "good", seed] = {0: 0.0, 10: 0.9 + 0.02 * seed, 20: 1.0}
+            runs[gap, "bad", seed] = {0: 0.0, 10: [0.0, 0.1, 0.3, 0.8][seed], 20: 0.5}
+        runs["a", "new", seed] = {0: 0.0, 10: 0.9 + 0.02 * seed}
+    return curve(tmp_path / "curves.csv", runs)
+
+
+def test_a_run_is_one_row_with_what_it_cost(curves) -> None:
+    rows = benchmark.summaries(benchmark.read([curves]), 20)
+    assert len(rows) == 16, "new was not measured after twenty"
+    first = rows[0]
+    assert (first["before"], first["after"], first["rollouts_to_90"]) == (0.0, 1.0, 10)
+    assert first["area"] == pytest.approx((4.5 + 9.5) / 20) and first["seconds"] == "7.5"
+    assert "seconds" not in benchmark.summaries(benchmark.read([curves]), 10)[0], "of the whole run alone"
+
+
+def test_the_interquartile_mean_is_that_of_the_middle_half(curves) -> None:
+    scores = benchmark.scored(benchmark.summaries(benchmark.read([curves]), 10), 10)
+    by = {(s["gap"], s["method"]): s for s in scores}
+    assert by["a", "bad"]["iqm"] == pytest.approx(0.2) and by["a", "bad"]["median"] == pytest.approx(0.2)
+    assert by["all", "bad"]["runs"] == 8 and ("all", "new") not in by, "new has no run in b"
+    assert all(s["low"] <= s["iqm"] <= s["high"] for s in scores)
+    assert benchmark.scored(benchmark.summaries(benchmark.read([curves]), 10), 10) == scores, "the bootstrap is seeded"
+
+
+def test_who_is_probably_better(curves) -> None:
+    found = benchmark.better(benchmark.summaries(benchmark.read([curves]), 10), 10)
+    by = {(f["method"], f["over"]): f for f in found}
+    assert by["good", "bad"]["probability"] == 1.0 and by["bad", "good"]["probability"] == 0.0
+    assert by["good", "new"]["probability"] == 0.5, "ties count half"
+    assert by["good", "new"]["gaps"] == "a" and by["good", "bad"]["gaps"] == "a b"
+
+
+def test_a_run_given_twice_is_refused(curves) -> None:
+    with pytest.raises(ValueError, match="is there twice"):
+        benchmark.read([curves, curves])
+
+
+def test_it_scores_what_was_measured_before_and_says_if_there_is_nothing(curves, tmp_path, monkeypatch) -> None:
+    words = ["benchmark", str(tmp_path / "out"), "--gaps", "a", "b", "--methods", "good", "bad", "--score-only"]
+    monkeypatch.setattr("sys.argv", [*words, "--with", str(curves), "--at", "10", "20"])
+    benchmark.main()
+    with (tmp_path / "out" / "runs.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 32 and {row["method"] for row in rows} == {"good", "bad"}
+    monkeypatch.setattr("sys.argv", [*words, "--with", str(curves), "--at", "30"])
+    with pytest.raises(SystemExit, match=r"after \[30\] rollouts"):
+        benchmark.main()
