@@ -7,6 +7,7 @@ transitions its guided version.
 Source: Haarnoja et al., arXiv:1812.05905 (SAC); the critics are TD-MPC2's, two-hot (arXiv:2310.16828).
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -98,7 +99,14 @@ def forget_critics(model: WorldModel) -> None:
 
 
 @in_own_precision
-def fit_soft(agent: Agent, found: Transitions, *, entropy_coef: float) -> dict[str, Tensor]:
+def fit_soft(
+    agent: Agent,
+    found: Transitions,
+    *,
+    entropy_coef: float,
+    weight: Tensor | None = None,
+    penalty: Callable[[Tensor], Tensor] | None = None,
+) -> dict[str, Tensor]:
     """One step of the critics, of the policy and of the target critics.
 
         y = r + gamma (1 - ended) (min_e Qbar_e(z', a') - alpha log pi(a'|z')),   a' ~ pi(z')
@@ -108,6 +116,8 @@ def fit_soft(agent: Agent, found: Transitions, *, entropy_coef: float) -> dict[s
         agent: Whose critics and policy head train; everything else stays.
         found: Transitions.
         entropy_coef: alpha.
+        weight: Of each transition in the critics' loss, [N]; None: 1.
+        penalty: Of Q [E, N] at what was taken, added to the critics' loss; None: nothing.
 
     Raises:
         FloatingPointError: If a loss is not finite; that part has changed nothing then.
@@ -120,11 +130,14 @@ def fit_soft(agent: Agent, found: Transitions, *, entropy_coef: float) -> dict[s
         target = found.reward + agent.discount * torch.where(found.ended, 0.0, worth)  # [N]
     logits = model.q_logits(found.z, found.action)  # [E, N, bins]
     goal = model.two_hot.encode(target).expand_as(logits)
-    metrics = {"q_loss": losses.two_hot_loss(logits, goal).mean()}
+    loss = losses.two_hot_loss(logits, goal)  # [E, N]
+    metrics = {"q_loss": (loss if weight is None else weight * loss).mean()}
+    if penalty is not None:
+        metrics["q_penalty"] = penalty(model.two_hot.decode(logits))
     check_finite(metrics)
     critics = list(model.q_ensemble.parameters())
     agent.model_optimizer.zero_grad()
-    metrics["q_loss"].backward(inputs=critics)
+    torch.stack([*metrics.values()]).sum().backward(inputs=critics)
     metrics["q_grad_norm"] = torch.nn.utils.clip_grad_norm_(critics, agent.grad_clip, foreach=True)
     agent.model_optimizer.step()
     action, log_prob = model.policy(found.z, agent.noise(len(found.z)))
