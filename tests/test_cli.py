@@ -95,6 +95,7 @@ def test_groups_and_effects_are_the_files_on_disk() -> None:
         (["device=gpu"], ["unknown device 'gpu'", "cuda"]),
         (["seed=one"], ["a number is needed"]),
         (["seed=-1"], ["a whole number"]),
+        (["eval_seed=-1"], ["eval_seed=-1: a whole number"]),
         (["seed=1,2"], ["Add -m"]),
         (["task=null"], ["one task is needed"]),
         (["randomize=push"], ["deploy has no randomize="]),

@@ -61,6 +61,46 @@ def tasks() -> str:
     return "\n\n".join(parts)
 
 
+def benchmark() -> str:
+    """Who is how good after so many rollouts, in each gap and in all, and who is probably better than whom."""
+    rows = read("benchmark/scores.csv")
+    gaps = list(dict.fromkeys(row["gap"] for row in rows))
+    parts = []
+    for count in dict.fromkeys(row["rollouts"] for row in rows):
+        mine = {(r["method"], r["gap"]): r for r in rows if r["rollouts"] == count}
+        lines = [
+            [f"`{m}`", *(mean_of(mine[m, g]) if (m, g) in mine else "" for g in gaps)]
+            for m in dict.fromkeys(method for method, _ in mine)
+        ]
+        heads = [gap if gap == "all" else f"`{gap}`" for gap in gaps]
+        parts.append(f"After {count} rollouts:\n\n{table(['method', *heads], lines)}")
+    better = [row for row in read("benchmark/better.csv") if row["method"] == "sgft"]
+    counts = list(dict.fromkeys(row["rollouts"] for row in better))
+    by = {(row["over"], row["rollouts"]): row for row in better}
+    lines = [
+        [f"`{other}`", *(probable(by[other, n]) if (other, n) in by else "" for n in counts)]
+        for other in dict.fromkeys(row["over"] for row in better)
+    ]
+    heads = [f"after {n} rollouts" for n in counts]
+    parts.append(f"How probable it is that a run of `sgft` ends above one of\n\n{table(['', *heads], lines)}")
+    runs = [row for row in read("benchmark/runs.csv") if row["seconds"]]
+    cost = []
+    for method in dict.fromkeys(row["method"] for row in runs):
+        own = [row for row in runs if row["method"] == method]
+        seconds, updates = (median(float(row[name]) for row in own) for name in ("seconds", "updates"))
+        cost.append([f"`{method}`", own[0]["rollouts"], f"{updates:.0f}", f"{seconds:.0f}"])
+    head = ["method", "real rollouts", "updates", "seconds, median"]
+    return "\n\n".join([*parts, "What a run costs:", table(head, cost)])
+
+
+def mean_of(row: Row) -> str:
+    return f"{percent(row['iqm'])} [{percent(row['low'])}, {percent(row['high'])}], {row['runs']}"
+
+
+def probable(row: Row) -> str:
+    return f"{percent(row['probability'])} [{percent(row['low'])}, {percent(row['high'])}]"
+
+
 def method_in_gap(row: Row) -> str:
     return f"`{row['gap']}`, {row['method']}"
 
@@ -232,6 +272,18 @@ def emps() -> str:
     return pick(read("emps/emps.csv"), {**head, "second mm": "second_mm", "pulses mm": "pulses_mm", "s": "seconds"})
 
 
+def healthy() -> str:
+    """Return of each implementation, median and range over its seeds."""
+    rows = read("healthy/healthy.csv")
+    lines = []
+    for method, ours in dict.fromkeys((row["method"], row["implementation"]) for row in rows):
+        own = [row for row in rows if (row["method"], row["implementation"]) == (method, ours)]
+        returns, steps = [float(row["return"]) for row in own], own[0]["steps"]
+        cell = f"{median(returns):.0f} ({min(returns):.0f} to {max(returns):.0f})"
+        lines.append([f"`{method}`", ours, steps, own[0]["updates"], len(own), cell])
+    return table(["method", "implementation", "steps", "updates", "seeds", "return"], lines)
+
+
 def critic() -> str:
     head = {"critic": "critic", "puck at x [m]": "puck_x_m", "V": "value", "return": "return"}
     return pick(read("critic_profile/critic_profile.csv"), head)
@@ -250,7 +302,9 @@ STUDIES: dict[str, Callable[[], str]] = {
     "entry": lambda: curves(read("entry/sb3_sac.csv"), lambda r: r["name"], "environment"),
     "audit": audit,
     "ladder": ladder,
-    "model_free": lambda: curves(read("model_free/model_free.csv"), method_in_gap, "gap and method"),
+    "benchmark": benchmark,
+    "paper": lambda: pick(read("paper/claims.csv"), {n: n for n in ("figure", "paper", "here", "verdict")}),
+    "healthy": healthy,
     "horizon": lambda: curves(read("horizon/horizon.csv"), lambda r: r["variant"], "variant"),
     "pendulum": lambda: curves(read("pendulum/pendulum.csv"), lambda r: r["method"], "method"),
     "critic_profile": critic,

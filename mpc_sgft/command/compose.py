@@ -158,8 +158,10 @@ def complete(cfg: DictConfig, name: str, chosen: Mapping[str, str | None], given
     for effect in OmegaConf.select(cfg, "gap.effects") or {}:
         if effect not in choices.effects():
             raise unknown("effect", str(effect), choices.effects(), "envs/effects/")
-    if not isinstance(cfg.seed, int) or isinstance(cfg.seed, bool) or cfg.seed < 0:
-        raise UserError(f"seed={cfg.seed}: a whole number from 0 on is needed.")
+    for key in ("seed", "eval_seed"):
+        value = cfg.get(key, 0)
+        if not isinstance(value, int) or isinstance(value, bool) or value < 0:
+            raise UserError(f"{key}={value}: a whole number from 0 on is needed.")
     bare = [text.lstrip("+") for text in given]
     gap_changes = [text.removeprefix("gap.effects.") for text in bare if text.startswith("gap.effects.")]
     names = {group: option for group, option in chosen.items() if option is not None}

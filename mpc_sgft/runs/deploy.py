@@ -275,8 +275,8 @@ class Deployment:
         if self.judge is None:
             latest = self.state["outcomes"][max(self.state["scores"], default=0) :]
             return score_of(*zip(*latest, strict=True))
-        act = planner_policy(self.transfer.acting, self.planner, EVAL_SEED)
-        return score(collect(self.judge, act, seed=EVAL_SEED))
+        seed = EVAL_SEED + 10 * self.cfg.get("eval_seed", 0)  # runs of before had none
+        return score(collect(self.judge, planner_policy(self.transfer.acting, self.planner, seed), seed=seed))
 
     def save(self) -> None:
         """Weights and exact state."""

@@ -107,6 +107,18 @@ def test_the_summary_holds_what_scripts_read(deployed):
     )
 
 
+def test_evaluation_episodes_follow_their_own_seed(pretrained, deployed, tmp_path):
+    def before(*words: str) -> float:
+        done = run(
+            "deploy", f"checkpoint={pretrained}", "gap=pendulum_torque", "rollouts=1", "method.updates=0", *words
+        )
+        return json.loads(done.stdout.splitlines()[-1])["return_curve"]["0"]
+
+    there = json.loads((deployed / "summary.json").read_text())["return_curve"]["0"]
+    assert before(f"run_dir={tmp_path / 'same'}", "seed=5") == there
+    assert before(f"run_dir={tmp_path / 'other'}", "seed=5", "eval_seed=${seed}") != there
+
+
 def test_deployment_freezes_what_it_must(pretrained, deployed):
     before, after = (load_file(f / "checkpoint" / "model.safetensors") for f in (pretrained, deployed))
     free = ("dynamics.", "policy_head.")
