@@ -66,7 +66,7 @@ def networks(size: str, precision: str, recorded: bool, device: torch.device, re
     model: WorldModel = instantiate(OmegaConf.load(ROOT / f"configs/model/{size}.yaml"), **sizes)
     numbers = OmegaConf.load(ROOT / "configs/train/default.yaml").agent
     how = {"precision": precision, "cuda_graph": recorded}
-    agent: Agent = instantiate(numbers, model=model, discount=0.99, device=device, **how)
+    agent: Agent = instantiate(numbers, model=model, discount=0.99, device=device, policy_delay=1, **how)
     planner = MPPI(action_dim=action_dim, horizon=4, **how, **SEARCH)
     act, batch = planner_policy(agent.model, planner, seed=0), random_batch(obs_dim, action_dim, 3).to(device)
     observation, fresh = torch.randn(1, obs_dim), torch.zeros(1, dtype=torch.bool)

@@ -122,7 +122,8 @@ def jobs(size: str, precision: str, many: bool) -> list[tuple[str, int, float, i
     sizes = {"obs_dim": obs_dim, "action_dim": action_dim, "decode_dim": min(obs_dim, 12)}
     model: WorldModel = instantiate(OmegaConf.load(ROOT / f"configs/model/{size}.yaml"), **sizes)
     train = OmegaConf.load(ROOT / "configs/train/default.yaml")
-    agent: Agent = instantiate(train.agent, model=model, discount=0.99, precision=precision)
+    whole = {"policy_delay": 1}  # every update has every part, as upstream's
+    agent: Agent = instantiate(train.agent, model=model, discount=0.99, precision=precision, **whole)
     out: list[tuple[str, int, float, int, int, Callable[[], object]]] = []
     for horizon in (3, 4):
         for decay in DECAYS if horizon == 4 else (1.0,):

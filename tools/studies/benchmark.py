@@ -33,6 +33,7 @@ from tools.studies.runner import write
 RUN = ["gap", "method", "seed", "rollouts", "before", "after", "area", "rollouts_to_90", "updates", "seconds"]
 SCORE = ["gap", "method", "rollouts", "runs", "median", "iqm", "low", "high"]
 BETTER = ["method", "over", "rollouts", "gaps", "probability", "low", "high"]
+NEEDED = {"gap", "method", "variant", "seed", "rollouts", "success"}
 RESAMPLES = 2000
 GOOD = 0.9  # success that a run is asked for
 Runs = dict[str, dict[str, dict[int, dict[int, dict[str, str]]]]]  # gap -> method -> seed -> rollouts -> row
@@ -43,12 +44,18 @@ def read(paths: Iterable[Path]) -> Runs:
     """Rows of curves as tools.studies.study writes them; a variant is part of a method's name.
 
     Raises:
-        ValueError: If two files hold the same run.
+        ValueError: If a file lacks a column, or two hold the same run.
     """
     runs: Runs = defaultdict(lambda: defaultdict(lambda: defaultdict(dict)))
     for path in paths:
         with path.open(newline="") as file:
-            for row in csv.DictReader(file):
+            table = csv.DictReader(file)
+            missing = NEEDED - set(table.fieldnames or [])
+            if missing:
+                raise ValueError(
+                    f"{path} has no column {', '.join(sorted(missing))}; curves have {', '.join(sorted(NEEDED))}"
+                )
+            for row in table:
                 method = " ".join(word for word in (row["method"], row["variant"]) if word)
                 curve, count = runs[row["gap"]][method][int(row["seed"])], int(row["rollouts"])
                 if count in curve:
@@ -160,7 +167,10 @@ def main() -> None:
     curves = args.folder / "curves.csv"
     if not args.score_only:
         study.run(curves, args)
-    runs = read([*([curves] if curves.exists() else []), *args.measured])
+    try:
+        runs = read([*([curves] if curves.exists() else []), *args.measured])
+    except (ValueError, FileNotFoundError) as error:
+        sys.exit(f"error: {error}")
     chosen: Runs = {gap: {m: runs[gap][m] for m in runs[gap] if m in args.methods} for gap in args.gaps if gap in runs}
     rows = {count: summaries(chosen, count) for count in args.at}
     if not any(rows.values()):

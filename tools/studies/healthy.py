@@ -123,11 +123,15 @@ def offline(method: AbstractMethod, seed: int, data: Steps, updates: int) -> tup
     return acting(agent), updates
 
 
-@torch.no_grad()
 def acting(agent: Agent) -> Act:
     """The mean action."""
     model = agent.model.eval()
-    return torch.no_grad()(lambda seen: model.policy_prior(model.encode(torch.from_numpy(seen)), None).numpy())
+
+    @torch.no_grad()
+    def act(seen: NDArray[np.float32]) -> NDArray[np.float32]:
+        return model.policy_prior(model.encode(torch.from_numpy(seen)), None).numpy()
+
+    return act
 
 
 def evaluated(act: Act) -> dict[str, float]:

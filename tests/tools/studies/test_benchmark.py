@@ -65,6 +65,15 @@ def test_a_run_given_twice_is_refused(curves) -> None:
         benchmark.read([curves, curves])
 
 
+def test_a_file_that_is_no_curve_is_refused_in_a_line(tmp_path, monkeypatch) -> None:
+    (tmp_path / "other.csv").write_text("gap,seed\na,0\n")
+    words = ["benchmark", str(tmp_path), "--gaps", "a", "--score-only", "--with"]
+    for name, says in (("other.csv", "has no column method"), ("nowhere.csv", "No such file")):
+        monkeypatch.setattr("sys.argv", [*words, str(tmp_path / name)])
+        with pytest.raises(SystemExit, match=says):
+            benchmark.main()
+
+
 def test_it_scores_what_was_measured_before_and_says_if_there_is_nothing(curves, tmp_path, monkeypatch) -> None:
     words = ["benchmark", str(tmp_path / "out"), "--gaps", "a", "b", "--methods", "good", "bad", "--score-only"]
     monkeypatch.setattr("sys.argv", [*words, "--with", str(curves), "--at", "10", "20"])
