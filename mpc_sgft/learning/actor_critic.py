@@ -66,20 +66,23 @@ def guided(model: WorldModel, found: Transitions, discount: float, steps: int) -
 
 
 @torch.no_grad()
-def branches(model: WorldModel, z: Tensor, noise: Tensor) -> Transitions:
+def branches(
+    model: WorldModel, z: Tensor, noise: Tensor, dynamics: Callable[[Tensor, Tensor], Tensor] | None = None
+) -> Transitions:
     """Short rollouts of the policy in the learned dynamics from latents [N, D], time first.
 
     Args:
         model: Whose policy, dynamics and reward.
         z: Where they start.
         noise: Standard normal, [T, N, A]; as many steps they have.
+        dynamics: Others than the model's, (z, action) -> next z.
 
     Source: Dyna (Sutton 1991); MBPO (Janner et al. 2019).
     """
     rows = []
     for step_noise in noise:
         action = model.policy(z, step_noise)[0]
-        next_z = model.next(z, action)
+        next_z = (dynamics or model.next)(z, action)
         never = torch.zeros(len(z), dtype=torch.bool, device=z.device)
         rows.append((z, action, model.reward(z, action, next_z), next_z, never))
         z = next_z

@@ -122,7 +122,7 @@ def test_half_of_each_batch_is_simulated_where_a_method_says_so(name: str) -> No
     t = make(f"method={name}")
     t.buffer.extend(rollout(0))
     real = t.batch()["episode"] < 1000
-    wanted = 8 if name in ("rlpd", "iql", "h2o") else 16
+    wanted = 8 if name in ("rlpd", "iql", "h2o", "asap") else 16
     assert len(real) == 16 and real[:wanted].all() and not real[wanted:].any()
 
 
@@ -136,6 +136,12 @@ def test_numbers_of_implicit_q_learning_out_of_range_are_refused_with_their_name
 def test_numbers_of_hybrid_learning_out_of_range_are_refused_with_their_name(bad: str) -> None:
     with pytest.raises(UserError, match=bad):
         make("method=h2o", f"method.{bad}")
+
+
+@pytest.mark.parametrize("bad", ["simulated_episodes=0", "steps=0", "shrink=-1", "rho=2"])
+def test_numbers_of_delta_actions_out_of_range_are_refused_with_their_name(bad: str) -> None:
+    with pytest.raises(UserError, match=bad):
+        make("method=asap", f"method.{bad}")
 
 
 @pytest.mark.parametrize("bad", ["slice_len=0", "branches=-1", "rho=0"])
