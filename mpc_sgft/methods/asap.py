@@ -59,9 +59,8 @@ class ASAP(AbstractMethod):
         action_noise: float,
     ):
         if simulated_episodes < 1 or steps < 1 or shrink < 0:
-            raise ValueError(
-                f"simulated_episodes={simulated_episodes} and steps={steps} must be 1 or more, shrink={shrink} 0 or more."
-            )
+            numbers = f"simulated_episodes={simulated_episodes} and steps={steps} must be 1 or more"
+            raise ValueError(f"{numbers}, shrink={shrink} 0 or more.")
         check_objective(steps, rho)
         self.lr, self.policy_lr, self.entropy_coef = lr, policy_lr, entropy_coef
         self.rho, self.shrink, self.steps = rho, shrink, steps
