@@ -7,7 +7,7 @@ and learning rate:
 
     sac     on its own steps, beside stable-baselines3
     iql     on the steps that stable-baselines3's SAC took, offline, beside d3rlpy
-    rlpd    on half as many steps of its own, with those as prior data, beside `sac` on as many
+    rlpd    on a quarter as many steps of its own, with those as prior data, beside `sac` on as many
 
 The methods see what Pendulum shows them in place of a latent. It needs `pip install 'mpc_sgft[sb3]'`, and d3rlpy, which
 asks for an older Gymnasium than it needs: `pip install --no-deps d3rlpy; pip install h5py gym click structlog colorama
@@ -191,7 +191,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("csv", type=Path)
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
-    parser.add_argument("--steps", type=int, default=10_000, help="of SAC; the others have as many updates, RLPD half")
+    parser.add_argument("--steps", type=int, default=10_000, help="of SAC; of RLPD a quarter")
     parser.add_argument("--expectile", type=float, default=0.7, help="of IQL")
     parser.add_argument("--temperature", type=float, default=1.0, help="of IQL, reward units")
     args = parser.parse_args()
@@ -215,10 +215,10 @@ def main() -> None:
         match method, implementation:
             case "sac", "ours":
                 act, updates = online(SAC(**SAC_NUMBERS), seed, args.steps)
-            case "sac", "ours, half the steps":
-                act, updates = online(SAC(**SAC_NUMBERS), seed, args.steps // 2)
+            case "sac", "ours, a quarter of the steps":
+                act, updates = online(SAC(**SAC_NUMBERS), seed, args.steps // 4)
             case "rlpd", _:
-                act, updates = online(RLPD(simulated_episodes=0, **SAC_NUMBERS), seed, args.steps // 2, data)
+                act, updates = online(RLPD(simulated_episodes=0, **SAC_NUMBERS), seed, args.steps // 4, data)
             case "iql", "ours":
                 shared = {k: v for k, v in SAC_NUMBERS.items() if k != "entropy_coef"}
                 act, updates = offline(IQL(**shared, **iql, simulated_episodes=0), seed, data, args.steps)
@@ -226,12 +226,12 @@ def main() -> None:
                 act, updates = d3rlpy_iql(seed, data, args.steps, iql)
             case _:
                 act, updates, began = of(seed).act, args.steps - RANDOM_STEPS, time.monotonic() - of(seed).seconds
-        steps = args.steps // 2 if method == "rlpd" or "half" in implementation else args.steps
+        steps = args.steps // 4 if method == "rlpd" or "quarter" in implementation else args.steps
         cost = {"steps": steps, "updates": updates, "seconds": round(time.monotonic() - began, 1)}
         return {"method": method, "implementation": implementation, "seed": seed} | cost | evaluated(act)
 
     ways = [("sac", "stable-baselines3"), ("sac", "ours"), ("iql", "d3rlpy"), ("iql", "ours")]
-    ways += [("sac", "ours, half the steps"), ("rlpd", "ours, half the steps")]
+    ways += [("sac", "ours, a quarter of the steps"), ("rlpd", "ours, a quarter of the steps")]
     try:
         import d3rlpy  # noqa: F401
     except ImportError:
