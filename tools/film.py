@@ -27,6 +27,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from envs.env import ControlEnv
 from envs.task import AbstractTask
+from envs.tasks.planar import PlanarTask
 from envs.tasks.push import Push
 from mpc_sgft.command import compose
 from mpc_sgft.runs import build
@@ -36,9 +37,11 @@ from mpc_sgft.runs.pretrain import EVAL_SEED
 ROLLOUTS = 3
 SCRIPTED = 64  # episodes that a scripted policy's success is counted in
 FRAMES_A_STEP = 2  # pictures of a control period
+PERIOD = 0.08  # [s] between pictures at least, where control periods are shorter
 HOLD = 2.5  # [s] that the last picture stays
 PANEL = (320, 316)  # [pixel] width and height of one picture
 BAR = 52  # [pixel] height of the captions above it
+TORSO, BESIDE = 1, 4.5  # body that the camera follows where a machine walks, and from how far [m]
 BACKGROUND, INK = (38, 44, 54), (235, 238, 242)
 GOOD, BAD = (106, 209, 133), (240, 128, 112)
 COLORS = 256  # of the GIF, chosen once for all pictures: what does not move then costs nothing
@@ -57,7 +60,7 @@ class Panel(NamedTuple):
     pictures: NDArray[np.uint8]  # [n, height, width, 3]
     title: str
     numbers: str  # what was measured over many episodes
-    success: bool
+    success: bool | None  # None: a task in which the return counts
 
 
 def episode(env: ControlEnv, act: Act, seed: int, steps: int) -> Episode:
@@ -105,6 +108,8 @@ def draw(task: AbstractTask, qpos: NDArray[np.float64], camera: mujoco.MjvCamera
         for row in qpos:
             data.qpos = row
             mujoco.mj_forward(model, data)
+            if isinstance(task, PlanarTask):  # it walks away
+                camera.lookat[0], camera.distance = data.xpos[TORSO, 0], BESIDE
             renderer.update_scene(data, camera)
             pictures.append(renderer.render())
     return np.stack(pictures)
@@ -123,7 +128,7 @@ def frames(panels: list[Panel]) -> list[Image.Image]:
             frame.paste(Image.fromarray(panel.pictures[k]), (left, BAR))
             pen.text((left + 10, 8), panel.title, INK, large)
             pen.text((left + 10, 30), panel.numbers, INK, small)
-            if k == count - 1:
+            if k == count - 1 and panel.success is not None:
                 word, color = ("done", GOOD) if panel.success else ("not done", BAD)
                 pen.text((left + PANEL[0] - 10, 42), word, color, large, anchor="rs")
             if i:
@@ -160,10 +165,14 @@ def film_scripted(task: str, gap: str, out: Path) -> list[Episode]:
         cfg = compose.compose("evaluate", [f"task={task}", f"gap={name}"], [])
         build.prepare_process(cfg)
         env, many = build.make_env(cfg, 1), build.make_env(cfg, SCRIPTED)
-        rate = score(collect(many, scripted_policy(many), seed=EVAL_SEED)).success
+        found = score(collect(many, scripted_policy(many), seed=EVAL_SEED))
         seen.append(episode(env, scripted_policy(env), EVAL_SEED, env.task.episode_steps))
-        numbers = f"scripted policy, {SCRIPTED} episodes: {rate:.0%}"
-        panels.append(Panel(draw(env.task, seen[-1].qpos, camera_of(env.task)), title, numbers, seen[-1].success))
+        walks = isinstance(env.task, PlanarTask)
+        worth = f"return {found.episode_return:.0f} of {env.task.episode_steps}" if walks else f"{found.success:.0%}"
+        numbers = f"scripted policy, {SCRIPTED} episodes: {worth}"
+        done = None if walks else seen[-1].success
+        often = max(1, round(PERIOD * FRAMES_A_STEP / env.task.control_dt))
+        panels.append(Panel(draw(env.task, seen[-1].qpos[::often], camera_of(env.task)), title, numbers, done))
         seconds = env.task.episode_steps * env.task.control_dt
     save_gif(out, frames(panels), seconds)
     return seen

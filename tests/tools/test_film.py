@@ -17,7 +17,7 @@ from tools.film import BAR, FRAMES_A_STEP, PANEL, Panel, camera_of, episode, fra
 ROOT = Path(__file__).parents[2]
 
 
-def panel(title: str, success: bool, count: int = 3) -> Panel:
+def panel(title: str, success: bool | None, count: int = 3) -> Panel:
     return Panel(np.zeros((count, PANEL[1], PANEL[0], 3), np.uint8), title, "success in 50 episodes: 0%", success)
 
 
@@ -53,6 +53,8 @@ def test_captions_stand_above_the_pictures_and_the_verdict_on_the_last_one() -> 
     fails, works = frames([panel("same", success=False)])[-1], frames([panel("same", success=True)])[-1]
     assert changed(fails, works, halves[0])
     assert not changed(fails, works, (0, BAR, PANEL[0], PANEL[1] + BAR))  # nothing is drawn over the pictures
+    none, *_, last = frames([panel("walks", success=None)])
+    assert not changed(none, last, halves[0]), "where the return counts there is no verdict"
 
 
 def test_the_film_is_as_long_as_its_shorter_half() -> None:
