@@ -10,7 +10,7 @@ steps, an episode about a minute of one core.
 
 import argparse
 import itertools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import cache, partial
 from pathlib import Path
 
@@ -21,7 +21,7 @@ from torch import Tensor
 from envs.effects.sensor_delay import SensorDelay
 from envs.env import ControlEnv
 from envs.task import Array
-from mpc_sgft.command.compose import compose
+from mpc_sgft.command.compose import compose, normalise
 from mpc_sgft.learning.world_model import WorldModel
 from mpc_sgft.runs import build
 from mpc_sgft.runs.collect import collect, planner_policy, score
@@ -107,9 +107,10 @@ def _fields(env: ControlEnv) -> list[Array]:
     return [*b.state, b.act, b.signal, b.delayed, b.clock, b.batch.bind("qacc_warmstart"), b.target, b.told]
 
 
-def measure(gap: str, horizon: int, reward: str, episodes: int) -> dict[str, object]:
-    """Success over the first evaluation episodes of a gap, a row of the CSV."""
-    cfg = compose("deploy", [f"gap={gap}", f"planner.horizon={horizon}", "planner.chunk_rows=832"], [])
+def measure(gap: str, horizon: int, reward: str, episodes: int, settings: Sequence[str] = ()) -> dict[str, object]:
+    """Success over the first evaluation episodes of a gap, a row of the CSV; `settings` are overrides of deploy."""
+    words = [f"gap={gap}", f"planner.horizon={horizon}", "planner.chunk_rows=832", *map(normalise, settings)]
+    cfg = compose("deploy", words, list(settings))
     build.prepare_process(cfg)
     agent, _ = build.load_agent(cfg)
     env = build.make_env(cfg, episodes)
@@ -136,12 +137,14 @@ def main() -> None:
     parser.add_argument("--horizons", nargs="+", type=int, default=[4])
     parser.add_argument("--reward", nargs="+", choices=("learned", "true"), default=["learned"])
     parser.add_argument("--episodes", type=int, default=24)
+    told = "overrides, e.g. task=hammer; rows do not tell them, so take another CSV"
+    parser.add_argument("--set", nargs="*", default=[], metavar="name=value", help=told)
     args = parser.parse_args()
     keys = [
         {"gap": gap, "horizon": horizon, "reward": reward}
         for gap, horizon, reward in itertools.product(args.gaps, args.horizons, args.reward)
     ]
-    measured(args.csv, COLUMNS, keys, partial(measure, episodes=args.episodes))
+    measured(args.csv, COLUMNS, keys, partial(measure, episodes=args.episodes, settings=args.set))
 
 
 if __name__ == "__main__":

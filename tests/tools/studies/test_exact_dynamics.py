@@ -7,8 +7,9 @@ import pytest
 import torch
 
 from mpc_sgft.command.compose import compose
+from mpc_sgft.command.errors import UserError
 from mpc_sgft.runs import build
-from tools.studies.exact_dynamics import ExactModel
+from tools.studies.exact_dynamics import ExactModel, measure
 
 
 @pytest.mark.parametrize("gap", ["turned", "sluggish", "glide"])
@@ -40,3 +41,11 @@ def test_a_gap_whose_sensor_is_late_is_refused() -> None:
     agent, _ = build.load_agent(cfg)
     with pytest.raises(ValueError, match="late sensor"):
         ExactModel(agent.model, build.make_env(cfg, 1), lambda n: build.make_env(cfg, n), true_reward=False)
+
+
+def test_another_task_is_measured_with_the_settings_it_is_given() -> None:
+    small = ["planner.num_candidates=8", "planner.num_elites=4", "planner.num_prior=2", "planner.iterations=1"]
+    row = measure("insert_real", 1, "learned", 1, ["task=insert", "task.env.episode_steps=3", *small])
+    assert row["gap"] == "insert_real" and row["episodes"] == 1 and np.isfinite(row["episode_return"])
+    with pytest.raises(UserError, match="No checkpoint"):
+        measure("insert_real", 1, "learned", 1, ["task=insert", "checkpoint=nowhere"])
