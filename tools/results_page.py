@@ -83,7 +83,7 @@ def benchmark() -> str:
     ]
     heads = [f"after {n} rollouts" for n in counts]
     parts.append(f"How probable it is that a run of `sgft` ends above one of\n\n{table(['', *heads], lines)}")
-    runs = [row for row in read("benchmark/runs.csv") if row["seconds"]]
+    runs = [row for row in read("benchmark/runs.csv") if row["seconds"] and row["updates"]]
     cost = []
     for method in dict.fromkeys(row["method"] for row in runs):
         own = [row for row in runs if row["method"] == method]

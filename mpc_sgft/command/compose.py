@@ -216,7 +216,7 @@ def resume(name: str, folder: str, overrides: Sequence[str], given: Sequence[str
     for override in parse(overrides):
         key = override.key_or_group
         if (
-            key in (*choices.groups(), "run_dir", "checkpoint", "seed")
+            key in (*choices.groups(), "run_dir", "checkpoint", "seed", "eval_seed")
             or key.startswith("gap.")
             or override.is_delete()
         ):

@@ -79,10 +79,10 @@ def branches(
 
     Source: Dyna (Sutton 1991); MBPO (Janner et al. 2019).
     """
-    rows = []
+    rows, following = [], model.next if dynamics is None else dynamics
     for step_noise in noise:
         action = model.policy(z, step_noise)[0]
-        next_z = (dynamics or model.next)(z, action)
+        next_z = following(z, action)
         never = torch.zeros(len(z), dtype=torch.bool, device=z.device)
         rows.append((z, action, model.reward(z, action, next_z), next_z, never))
         z = next_z

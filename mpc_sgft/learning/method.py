@@ -83,6 +83,12 @@ class AbstractMethod(ABC):
         assert not state, state
 
 
+def check_simulated(episodes: int, least: int) -> None:
+    """Raise ValueError if a method is given too few simulated episodes."""
+    if episodes < least:
+        raise ValueError(f"simulated_episodes={episodes} must be {least} or more.")
+
+
 def check_objective(horizon: int, rho: float) -> None:
     """Raise ValueError if the horizon is not positive or rho lies outside (0, 1]."""
     if horizon < 1:

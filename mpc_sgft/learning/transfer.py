@@ -130,7 +130,7 @@ class Transfer:
             "agent": self.agent.state_dict(),
             "method": self.method.state_dict(),
             "buffer": self.buffer.state_dict(),
-            "simulated": self.simulated and self.simulated.state_dict(),
+            "simulated": None if self.simulated is None else self.simulated.state_dict(),
             "averaged": self.averaged.state_dict(),
             "acting": self.acting.state_dict(),
             "starts": [x.clone() for x in self.starts],

@@ -11,7 +11,7 @@ from torch import Tensor
 from mpc_sgft.learning.actor_critic import branches, fit_soft
 from mpc_sgft.learning.agent import Agent
 from mpc_sgft.learning.delta_action import DeltaAction
-from mpc_sgft.learning.method import AbstractMethod, check_objective
+from mpc_sgft.learning.method import AbstractMethod, check_objective, check_simulated
 from mpc_sgft.learning.observation_map import Sensed
 from mpc_sgft.learning.slices import Slices, floats, to_slices
 
@@ -58,9 +58,9 @@ class ASAP(AbstractMethod):
         slice_len: int,
         action_noise: float,
     ):
-        if simulated_episodes < 1 or steps < 1 or shrink < 0:
-            numbers = f"simulated_episodes={simulated_episodes} and steps={steps} must be 1 or more"
-            raise ValueError(f"{numbers}, shrink={shrink} 0 or more.")
+        check_simulated(simulated_episodes, 1)
+        if steps < 1 or shrink < 0:
+            raise ValueError(f"steps={steps} must be 1 or more, and shrink={shrink} 0 or more.")
         check_objective(steps, rho)
         self.lr, self.policy_lr, self.entropy_coef = lr, policy_lr, entropy_coef
         self.rho, self.shrink, self.steps = rho, shrink, steps

@@ -1,5 +1,6 @@
 """Dynamics-aware hybrid learning: soft actor-critic on real data, and on simulated as far as they could be real."""
 
+import copy
 from collections.abc import Mapping
 from typing import Any
 
@@ -10,7 +11,7 @@ from torch import Tensor
 from mpc_sgft.learning.actor_critic import fit_soft, of_slices
 from mpc_sgft.learning.agent import Agent
 from mpc_sgft.learning.dynamics_gap import DynamicsGap
-from mpc_sgft.learning.method import AbstractMethod
+from mpc_sgft.learning.method import AbstractMethod, check_simulated
 from mpc_sgft.learning.observation_map import Sensed
 from mpc_sgft.learning.slices import floats, to_slices
 
@@ -22,8 +23,8 @@ class H2O(AbstractMethod):
     """Critics and policy train as in `SAC` on batches of which half is simulated; two classifiers learn which of these
     transitions could be real.
 
-        w = min(1, P_real(z'|z, a) / P_sim(z'|z, a)) of simulated transitions, 1 of real ones
-        u = -log of that ratio, where it is positive
+        w = P_real(z'|z, a) / P_sim(z'|z, a) of simulated transitions, in [1e-5, 1], and 1 of real ones
+        u = -log of that ratio, in [1e-5, 10]
         the critics' losses are weighed by w, and to them comes
         beta (log E_sim[u / E_sim[u] exp Q(z, a)] - E_real[Q(z, a)])
 
@@ -31,7 +32,9 @@ class H2O(AbstractMethod):
 
     What differs from the publication: policy and critics begin as they were pretrained; real data grow by the rollout,
     where there they are offline, and simulated ones are of the pretrained policy, where there the policy collects anew;
-    the gap is judged between latents of the pretrained world model; the critics are two-hot.
+    u is that of the one transition that was seen, where there it is a mean over the simulator's; the gap is judged
+    between latents of the pretrained world model, of which the simulated ones have its noise of observation; the
+    critics are two-hot.
 
     Args:
         lr, policy_lr: Of Adam for critics and classifiers, and for the policy.
@@ -58,10 +61,9 @@ class H2O(AbstractMethod):
         slice_len: int,
         action_noise: float,
     ):
-        if simulated_episodes < 1 or penalty < 0:
-            raise ValueError(
-                f"simulated_episodes={simulated_episodes} must be 1 or more, and penalty={penalty} 0 or more."
-            )
+        check_simulated(simulated_episodes, 1)
+        if penalty < 0:
+            raise ValueError(f"penalty={penalty} must be 0 or more.")
         self.lr, self.policy_lr, self.entropy_coef, self.penalty = lr, policy_lr, entropy_coef, penalty
         self.simulated_episodes, self.updates = simulated_episodes, updates
         self.slice_len, self.action_noise = slice_len, action_noise
@@ -89,7 +91,7 @@ class H2O(AbstractMethod):
         return floats(metrics | {"simulated_weight": weight[~real].mean()})
 
     def state_dict(self) -> dict[str, Any]:
-        return {"gap": self.gap.state_dict(), "optimizer": self.gap.optimizer.state_dict()}
+        return copy.deepcopy({"gap": self.gap.state_dict(), "optimizer": self.gap.optimizer.state_dict()})
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         self.gap.load_state_dict(state["gap"])

@@ -6,7 +6,7 @@ from torch import Tensor
 from mpc_sgft.learning.actor_critic import of_slices
 from mpc_sgft.learning.agent import Agent
 from mpc_sgft.learning.implicit_q import check_implicit, fit_implicit
-from mpc_sgft.learning.method import AbstractMethod
+from mpc_sgft.learning.method import AbstractMethod, check_simulated
 from mpc_sgft.learning.observation_map import Sensed
 from mpc_sgft.learning.slices import floats, to_slices
 
@@ -31,7 +31,7 @@ class IQL(AbstractMethod):
         simulated_episodes, updates, slice_len, action_noise: As in `AbstractMethod`.
 
     Raises:
-        ValueError: If expectile or temperature is out of range.
+        ValueError: If expectile or temperature is out of range, or simulated_episodes negative.
 
     Source: Kostrikov, Nair, Levine, ICLR 2022, arXiv:2110.06169 (its beta is 1 / lambda).
     """
@@ -49,6 +49,7 @@ class IQL(AbstractMethod):
         action_noise: float,
     ):
         check_implicit(expectile, temperature)
+        check_simulated(simulated_episodes, 0)
         self.lr, self.policy_lr, self.expectile, self.temperature = lr, policy_lr, expectile, temperature
         self.simulated_episodes, self.updates = simulated_episodes, updates
         self.slice_len, self.action_noise = slice_len, action_noise

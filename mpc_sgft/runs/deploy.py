@@ -22,7 +22,7 @@ from mpc_sgft.learning.transfer import Transfer, open_loop_error
 from mpc_sgft.runs import build, robot
 from mpc_sgft.runs.collect import Score, collect, planner_policy, score, score_of
 from mpc_sgft.runs.explore import explored
-from mpc_sgft.runs.pretrain import EVAL_SEED, StopRequest
+from mpc_sgft.runs.pretrain import StopRequest, evaluation_seed
 from mpc_sgft.runs.real_rollout import begin, drive, start_seed
 from mpc_sgft.session import person
 from mpc_sgft.session.operator import Nobody, Operator
@@ -84,7 +84,7 @@ def make_transfer(
         capacity=(cfg.rollouts + 1) * episode_steps,
         batch_size=cfg.train.replay.batch_size,
         seed=cfg.seed,
-        simulated=simulated or partial(explored, cfg.seed, build.agents_of(cfg), agent.model),
+        simulated=simulated or partial(explored, cfg, agent.model),
     )
 
 
@@ -275,7 +275,7 @@ class Deployment:
         if self.judge is None:
             latest = self.state["outcomes"][max(self.state["scores"], default=0) :]
             return score_of(*zip(*latest, strict=True))
-        seed = EVAL_SEED + 10 * self.cfg.get("eval_seed", 0)  # runs of before had none
+        seed = evaluation_seed(self.cfg)
         return score(collect(self.judge, planner_policy(self.transfer.acting, self.planner, seed), seed=seed))
 
     def save(self) -> None:

@@ -77,17 +77,22 @@ class Explorer:
         return Collected(steps, self.env.backend.counters["unstable"] - before)
 
 
-def explored(seed: int, task: str, model: WorldModel, episodes: int) -> TensorDict:
-    """Episodes [N, T] of a pretrained policy that explores in the randomised simulator as it did in pretraining.
+def explored(cfg: DictConfig, model: WorldModel, episodes: int) -> TensorDict:
+    """Episodes [N, T] of a pretrained policy that explores in the randomised simulator as configs/pretrain.yaml says.
 
     Args:
-        seed: Of the draws and of the noise.
-        task: Whose simulator.
+        cfg: A deployment's config: its seed, its `task.` settings, and the simulator of the task that its agent is of.
         model: The policy.
         episodes: N.
+
+    Raises:
+        UserError: If the policy does not fit the task.
     """
-    cfg = compose("pretrain", [f"task={task}", f"num_envs={episodes}", f"seed={seed}"], [])
-    worker = Explorer(cfg, dict(model.sizes))
+    task = build.agents_of(cfg)
+    own = [text for text in cfg.overrides if text.startswith("task.")] if task == cfg.chosen.task else []
+    words = [f"task={task}", f"num_envs={episodes}", f"seed={cfg.seed}", f"physics={cfg.physics}", *own]
+    worker = Explorer(compose("pretrain", words, []), dict(model.sizes))
+    build.check_fits(model, worker.env)
     with closing(worker.env.backend):
         return worker.collect(Round(0, policy_weights(model))).steps
 

@@ -152,6 +152,11 @@ def pretrain(cfg: DictConfig) -> int:
     return 0
 
 
+def evaluation_seed(cfg: DictConfig) -> int:
+    """Of the evaluation episodes that `eval_seed` chooses, downwards from those of pretraining."""
+    return EVAL_SEED - 10 * cfg.eval_seed
+
+
 def start_agent(cfg: DictConfig, env: ControlEnv) -> Agent:
     """A fresh agent, or that of `checkpoint=` to go on from with new data.
 

@@ -35,6 +35,7 @@ def test_every_study_is_on_the_page_and_says_how_it_was_made() -> None:
         readme = (folder / "README.md").read_text()
         for fact in ("command", "commit", "machine", "seeds"):
             assert re.search(rf"^- {fact}: \S", readme, re.M), (folder.name, fact)
+        assert not re.search(r"\b(TEXT|COMMIT|METHODS)\b", readme), f"{folder.name}: something is left to be filled in"
     assert set(results_page.STUDIES) == {p.name for p in RESULTS.iterdir()}
 
 

@@ -3,10 +3,11 @@
     python -m tools.studies.benchmark results/benchmark --gaps turned skate --methods sgft sac iql --seeds 0 1 2 3 4
 
 Runs are those of `tools.studies.study`: side by side, resumable, on other machines with --launcher. `--with` takes in
-curves that were measured before, `--score-only` runs nothing. In FOLDER it writes
+curves that were measured before, and what they hold is not run again; `--score-only` runs nothing. In FOLDER it writes
 
     curves.csv    success after so many real rollouts, of the runs made here
-    runs.csv      one row a run: success, area under the curve, and what it cost in rollouts, updates and seconds
+    runs.csv      one row a run and number of rollouts: success before and after, area under the curve, and once a run
+                  what it cost in updates and seconds, evaluations included
     scores.csv    each gap, and all of them: median, interquartile mean, and its 95 % bootstrap interval
     better.csv    how probable it is that a run of one method ends above one of another, and its interval
 
@@ -19,7 +20,7 @@ import csv
 import itertools
 import sys
 import warnings
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -41,7 +42,7 @@ Scores = NDArray[np.float64]  # [runs, gaps]
 
 
 def read(paths: Iterable[Path]) -> Runs:
-    """Rows of curves as tools.studies.study writes them; a variant is part of a method's name.
+    """Rows of curves as tools.studies.study writes them; a variant is part of a method's name (`named`).
 
     Raises:
         ValueError: If a file lacks a column, or two hold the same run.
@@ -56,7 +57,7 @@ def read(paths: Iterable[Path]) -> Runs:
                     f"{path} has no column {', '.join(sorted(missing))}; curves have {', '.join(sorted(NEEDED))}"
                 )
             for row in table:
-                method = " ".join(word for word in (row["method"], row["variant"]) if word)
+                method = named(row["method"], row["variant"])
                 curve, count = runs[row["gap"]][method][int(row["seed"])], int(row["rollouts"])
                 if count in curve:
                     raise ValueError(
@@ -64,6 +65,10 @@ def read(paths: Iterable[Path]) -> Runs:
                     )
                 curve[count] = row
     return runs
+
+
+def named(method: str, variant: str) -> str:
+    return f"{method} {variant}".strip()
 
 
 def summaries(runs: Runs, rollouts: int) -> list[dict[str, Any]]:
@@ -80,11 +85,17 @@ def summaries(runs: Runs, rollouts: int) -> list[dict[str, Any]]:
                 cost = {key: curve[rollouts].get(key) or "" for key in ("updates", "seconds")}
                 found.append(
                     {"gap": gap, "method": method, "seed": seed, "rollouts": rollouts, "before": success[0]}
-                    | {"after": success[-1], "area": round(float(np.trapezoid(success, counts)) / max(rollouts, 1), 4)}
+                    | {"after": success[-1], "area": area(success, counts)}
                     | {"rollouts_to_90": reached[0] if reached else ""}
                     | (cost if rollouts == max(curve) else {})
                 )
     return found
+
+
+def area(success: Sequence[float], counts: Sequence[int]) -> float:
+    """Mean success on the way, of a curve that runs straight between its points."""
+    width = counts[-1] - counts[0]
+    return round(float(np.trapezoid(success, counts)) / width, 4) if width else success[-1]
 
 
 def matrix(rows: Sequence[dict[str, Any]], method: str, gaps: Sequence[str]) -> Scores | None:
@@ -102,10 +113,14 @@ def estimates(scores: dict[str, Any], measure: Callable[..., Any]) -> dict[str, 
     """
     from rliable import library
 
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of the bootstrap's own arguments, which rliable passes the old way
-        state = np.random.RandomState(0)
-        points, intervals = library.get_interval_estimates(scores, measure, reps=RESAMPLES, random_state=state)
+    before = np.random.get_state()
+    np.random.seed(0)  # which rliable's resampling draws from, whatever generator it is given
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of the bootstrap's own arguments, which rliable passes the old way
+            points, intervals = library.get_interval_estimates(scores, measure, reps=RESAMPLES)
+    finally:
+        np.random.set_state(before)
     return {key: [round(float(x), 4) for x in (np.ravel(points[key])[0], *intervals[key][:, 0])] for key in scores}
 
 
@@ -129,24 +144,21 @@ def scored(rows: Sequence[dict[str, Any]], rollouts: int) -> list[dict[str, Any]
 
 
 def better(rows: Sequence[dict[str, Any]], rollouts: int) -> list[dict[str, Any]]:
-    """For each two methods, over the gaps in which both have as many runs in each; ties count half."""
+    """For each two methods, over the gaps in which each has all of its runs; ties count half."""
     from rliable import metrics
 
     methods, found = list(dict.fromkeys(row["method"] for row in rows)), []
-    for one, other in itertools.permutations(methods, 2):
-        gaps = [
-            g
-            for g in dict.fromkeys(r["gap"] for r in rows)
-            if all(matrix(rows, m, [g]) is not None for m in (one, other))
-        ]
-        pair = [matrix(rows, method, gaps) for method in (one, other)] if gaps else [None]
-        if any(scores is None for scores in pair):
-            continue
-        value, low, high = estimates({"pair": tuple(pair)}, metrics.probability_of_improvement)["pair"]
-        found.append(
-            {"method": one, "over": other, "rollouts": rollouts, "gaps": " ".join(gaps), "probability": value}
-            | {"low": low, "high": high}
-        )
+    counts = Counter((row["method"], row["gap"]) for row in rows)
+    most = {m: max(n for (method, _), n in counts.items() if method == m) for m in methods}
+    for pair in itertools.permutations(methods, 2):
+        gaps = [gap for gap in dict.fromkeys(r["gap"] for r in rows) if all(counts[m, gap] == most[m] for m in pair)]
+        if gaps:
+            scores = tuple(matrix(rows, method, gaps) for method in pair)
+            value, low, high = estimates({"pair": scores}, metrics.probability_of_improvement)["pair"]
+            found.append(
+                {"method": pair[0], "over": pair[1], "rollouts": rollouts, "gaps": " ".join(gaps)}
+                | {"probability": value, "low": low, "high": high}
+            )
     return found
 
 
@@ -165,13 +177,19 @@ def main() -> None:
     except ImportError:
         parser.error("rliable is not installed: pip install 'mpc_sgft[benchmark]'")
     curves = args.folder / "curves.csv"
-    if not args.score_only:
-        study.run(curves, args)
+    wanted = list(itertools.product(args.gaps, args.methods, args.variants, args.seeds))
     try:
+        there = read(args.measured)
+        if not args.score_only:
+            known = {key for key in wanted if key[3] in there[key[0]][named(*key[1:3])]}
+            study.run(curves, args, args.folder.name, known)
         runs = read([*([curves] if curves.exists() else []), *args.measured])
     except (ValueError, FileNotFoundError) as error:
         sys.exit(f"error: {error}")
-    chosen: Runs = {gap: {m: runs[gap][m] for m in runs[gap] if m in args.methods} for gap in args.gaps if gap in runs}
+    chosen: Runs = {gap: {} for gap in args.gaps}
+    for gap, method, variant, seed in wanted:
+        if seed in runs[gap][named(method, variant)]:
+            chosen[gap].setdefault(named(method, variant), {})[seed] = runs[gap][named(method, variant)][seed]
     rows = {count: summaries(chosen, count) for count in args.at}
     if not any(rows.values()):
         sys.exit(f"no run of {', '.join(args.methods)} in {', '.join(args.gaps)} was measured after {args.at} rollouts")

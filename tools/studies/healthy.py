@@ -209,24 +209,21 @@ def main() -> None:
             known[seed] = Theirs(seed, args.steps)
         return known[seed]
 
-    def work(method: str, implementation: str, seed: int) -> dict:
+    def work(method: str, implementation: str, seed: int, steps: int) -> dict:
         data = of(seed).data
         began = time.monotonic()
         match method, implementation:
-            case "sac", "ours":
-                act, updates = online(SAC(**SAC_NUMBERS), seed, args.steps)
-            case "sac", "ours, a quarter of the steps":
-                act, updates = online(SAC(**SAC_NUMBERS), seed, args.steps // 4)
+            case "sac", "stable-baselines3":
+                act, updates, began = of(seed).act, steps - RANDOM_STEPS, time.monotonic() - of(seed).seconds
+            case "sac", _:
+                act, updates = online(SAC(**SAC_NUMBERS), seed, steps)
             case "rlpd", _:
-                act, updates = online(RLPD(simulated_episodes=0, **SAC_NUMBERS), seed, args.steps // 4, data)
+                act, updates = online(RLPD(simulated_episodes=0, **SAC_NUMBERS), seed, steps, data)
             case "iql", "ours":
                 shared = {k: v for k, v in SAC_NUMBERS.items() if k != "entropy_coef"}
-                act, updates = offline(IQL(**shared, **iql, simulated_episodes=0), seed, data, args.steps)
-            case "iql", _:
-                act, updates = d3rlpy_iql(seed, data, args.steps, iql)
+                act, updates = offline(IQL(**shared, **iql, simulated_episodes=0), seed, data, steps)
             case _:
-                act, updates, began = of(seed).act, args.steps - RANDOM_STEPS, time.monotonic() - of(seed).seconds
-        steps = args.steps // 4 if method == "rlpd" or "quarter" in implementation else args.steps
+                act, updates = d3rlpy_iql(seed, data, steps, iql)
         cost = {"steps": steps, "updates": updates, "seconds": round(time.monotonic() - began, 1)}
         return {"method": method, "implementation": implementation, "seed": seed} | cost | evaluated(act)
 
@@ -236,7 +233,12 @@ def main() -> None:
         import d3rlpy  # noqa: F401
     except ImportError:
         ways.remove(("iql", "d3rlpy"))
-    keys = [{"method": m, "implementation": i, "seed": seed} for seed in args.seeds for m, i in ways]
+    few = args.steps // 4
+    keys = [
+        {"method": m, "implementation": i, "seed": seed, "steps": few if "quarter" in i else args.steps}
+        for seed in args.seeds
+        for m, i in ways
+    ]
     measured(args.csv, COLUMNS, keys, work)
 
 

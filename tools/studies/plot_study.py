@@ -27,17 +27,29 @@ COLOURS = {  # of a method in every figure
     "sac": "#ff7f0e",
     "rlpd": "#8c564b",
     "iql": "#7f7f7f",
+    "h2o": "#bcbd22",
+    "asap": "#e377c2",
+    "zero_shot": "#333333",
 }
 Curves = dict[str, dict[str, dict[int, list[float]]]]  # gap -> label -> rollouts -> of each seed
 
 
 def read(paths: list[Path], column: str = "success") -> Curves:
-    """Success, or another column, of each seed."""
+    """Success, or another column, of each seed.
+
+    Raises:
+        ValueError: If two files hold the same run.
+    """
     curves: Curves = defaultdict(lambda: defaultdict(lambda: defaultdict(list)))
+    seen = set()
     for path in paths:
         with path.open() as file:
             for row in csv.DictReader(file):
                 label = " ".join(x for x in (row["method"], row["variant"]) if x)
+                key = row["gap"], label, row["seed"], row["rollouts"]
+                if key in seen:
+                    raise ValueError(f"{path}: {label} in {row['gap']}, seed {row['seed']}, is there twice")
+                seen.add(key)
                 curves[row["gap"]][label][int(row["rollouts"])].append(float(row[column]))
     return curves
 

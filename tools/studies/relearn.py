@@ -21,7 +21,7 @@ from mpc_sgft.learning.transfer import Transfer
 from mpc_sgft.runs import build
 from mpc_sgft.runs.collect import collect, planner_policy, score
 from mpc_sgft.runs.deploy import make_transfer
-from mpc_sgft.runs.pretrain import EVAL_SEED
+from mpc_sgft.runs.pretrain import evaluation_seed
 from mpc_sgft.storage.episode_file import read_episode
 from mpc_sgft.storage.metrics import progress
 from mpc_sgft.storage.rollout import from_episode
@@ -75,7 +75,8 @@ def relearn(cfg: DictConfig, rollouts: list[TensorDict], at: list[int]) -> tuple
             transfer.learn(steps)
         bar.update(1)
         if count in at:
-            result = score(collect(judge, planner_policy(transfer.acting, planner, EVAL_SEED), seed=EVAL_SEED))
+            seed = evaluation_seed(cfg)
+            result = score(collect(judge, planner_policy(transfer.acting, planner, seed), seed=seed))
             success[count] = result.success
     bar.close()
     return transfer, success

@@ -11,6 +11,7 @@ seed s uses number s modulo their count.
 import argparse
 import itertools
 import sys
+from collections.abc import Collection
 from pathlib import Path
 
 from tools.studies.runner import each, finished, first_mean, write
@@ -39,15 +40,27 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def run(path: Path, args: argparse.Namespace) -> None:
-    """Run what is not there yet, and write the learning curves of all to a CSV; exits if some failed."""
-    jobs = list(itertools.product(args.seeds, args.gaps, args.methods, args.variants))
+def run(path: Path, args: argparse.Namespace, name: str, known: Collection[tuple[str, str, str, int]] = ()) -> None:
+    """Run what is not there yet, and write the learning curves of all to a CSV; exits if some failed.
+
+    Args:
+        path: The CSV.
+        args: Of `add_arguments`.
+        name: That the run folders begin with: other settings want another one.
+        known: Runs that were measured elsewhere, (gap, method, variant, seed).
+    """
+    every = itertools.product(args.seeds, args.gaps, args.methods, args.variants)
+    jobs = [
+        (seed, gap, method, variant)
+        for seed, gap, method, variant in every
+        if (gap, method, variant, seed) not in known
+    ]
 
     def work(job: tuple[int, str, str, str]) -> dict:
         seed, gap, method, variant = job
         checkpoint = args.checkpoints[seed % len(args.checkpoints)]
         label = "-".join(
-            str(x).translate(str.maketrans("/= ", "__+")) for x in (path.stem, gap, method, variant, seed) if x != ""
+            str(x).translate(str.maketrans("/= ", "__+")) for x in (name, gap, method, variant, seed) if x != ""
         )
         words = [f"gap={gap}", f"method={method}", f"seed={seed}", "log.rerun=false"]
         words += variant.split()
@@ -82,7 +95,7 @@ def main() -> None:
     parser.add_argument("csv", type=Path)
     add_arguments(parser)
     args = parser.parse_args()
-    run(args.csv, args)
+    run(args.csv, args, args.csv.stem)
 
 
 if __name__ == "__main__":

@@ -136,6 +136,8 @@ def test_numbers_of_implicit_q_learning_out_of_range_are_refused_with_their_name
 def test_numbers_of_hybrid_learning_out_of_range_are_refused_with_their_name(bad: str) -> None:
     with pytest.raises(UserError, match=bad):
         make("method=h2o", f"method.{bad}")
+    with pytest.raises(UserError, match="simulated_episodes=-1 must be 0 or more"):
+        make("method=rlpd", "method.simulated_episodes=-1")
 
 
 @pytest.mark.parametrize("bad", ["simulated_episodes=0", "steps=0", "shrink=-1", "rho=2"])

@@ -1,18 +1,27 @@
 """Simulated episodes of a pretrained policy, for methods that go on learning from them."""
 
+import pytest
 import torch
 
 from mpc_sgft.command.compose import compose
+from mpc_sgft.command.errors import UserError
 from mpc_sgft.runs import build
 from mpc_sgft.runs.explore import explored
 
 
 def test_explored_episodes_are_those_of_pretraining_and_follow_the_seed() -> None:
-    agent, _ = build.load_agent(compose("deploy", [], []))
+    cfg, other = compose("deploy", [], []), compose("deploy", ["seed=1"], [])
+    agent, _ = build.load_agent(cfg)
     weights = {k: v.clone() for k, v in agent.model.state_dict().items()}
-    steps = explored(0, "push", agent.model, 6)
+    steps = explored(cfg, agent.model, 6)
     assert steps.shape == (6, 40) and steps["observation"].shape[-1] == agent.model.obs_dim
     assert steps["next", "success"].any(), "the shipped policy can push"
-    assert torch.equal(explored(0, "push", agent.model, 6)["action"], steps["action"])
-    assert not torch.equal(explored(1, "push", agent.model, 6)["action"], steps["action"])
+    assert torch.equal(explored(cfg, agent.model, 6)["action"], steps["action"])
+    assert not torch.equal(explored(other, agent.model, 6)["action"], steps["action"])
+    towel = compose("deploy", ["task=push_towel", "gap=push_towel_real", "task.env.episode_steps=30"], [])
+    assert torch.equal(explored(towel, agent.model, 6)["action"], steps["action"]), "its agents are of push"
+    shorter = compose("deploy", ["task.env.episode_steps=30"], ["task.env.episode_steps=30"])
+    assert explored(shorter, agent.model, 6).shape == (6, 30)
+    with pytest.raises(UserError, match="obs_dim"):
+        explored(compose("deploy", ["task.history=1"], ["task.history=1"]), agent.model, 6)
     assert all(torch.equal(v, weights[k]) for k, v in agent.model.state_dict().items())

@@ -3,12 +3,17 @@
 import csv
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from tools.studies import benchmark
 from tools.studies.study import COLUMNS
 
 pytest.importorskip("rliable", reason="needs rliable")
+
+
+DONE = {"gap": "a", "wall_seconds": 1.0, "updates": 5, "frozen_sha256": "0" * 64, "evaluation_episodes": 2}
+DONE |= {"curve": {"0": 0.0, "10": 0.5}}
 
 
 def curve(path: Path, runs: dict[tuple[str, str, int], dict[int, float]]) -> Path:
@@ -49,7 +54,36 @@ def test_the_interquartile_mean_is_that_of_the_middle_half(curves) -> None:
     assert by["a", "bad"]["iqm"] == pytest.approx(0.2) and by["a", "bad"]["median"] == pytest.approx(0.2)
     assert by["all", "bad"]["runs"] == 8 and ("all", "new") not in by, "new has no run in b"
     assert all(s["low"] <= s["iqm"] <= s["high"] for s in scores)
-    assert benchmark.scored(benchmark.summaries(benchmark.read([curves]), 10), 10) == scores, "the bootstrap is seeded"
+
+
+def test_intervals_are_the_same_each_time_and_leave_the_generator_alone() -> None:
+    scores = {"a": np.random.default_rng(0).random((5, 4))}
+    np.random.seed(7)
+    untouched = np.random.random()
+    np.random.seed(7)
+    first = benchmark.estimates(scores, lambda x: np.array([x.mean()]))
+    assert np.random.random() == untouched
+    assert benchmark.estimates(scores, lambda x: np.array([x.mean()])) == first
+    assert first["a"][1] < first["a"][0] < first["a"][2]
+
+
+def test_what_was_measured_before_is_not_run_again(curves, tmp_path, monkeypatch) -> None:
+    ran = []
+
+    def finished(command: str, folder: Path, words: list[str], launcher: str | None) -> dict:
+        ran.append(words)
+        return DONE | {key: value for key, value in (word.split("=") for word in words)}
+
+    monkeypatch.setattr(benchmark.study, "finished", finished)
+    monkeypatch.setattr(benchmark.study, "first_mean", lambda *_: None)
+    words = ["benchmark", str(tmp_path / "out"), "--gaps", "a", "--methods", "good", "new", "--seeds", "3", "4"]
+    monkeypatch.setattr("sys.argv", [*words, "--with", str(curves), "--at", "10", "--jobs", "1"])
+    benchmark.main()
+    assert [word[1:3] for word in ran] == [["method=good", "seed=4"], ["method=new", "seed=4"]]
+    with (tmp_path / "out" / "runs.csv").open() as file:
+        rows = {(row["method"], row["seed"]): row for row in csv.DictReader(file)}
+    assert set(rows) == {(m, s) for m in ("good", "new") for s in "34"}
+    assert rows["good", "3"]["after"] == "0.96" and rows["good", "4"]["after"] == "0.5"
 
 
 def test_who_is_probably_better(curves) -> None:
@@ -76,6 +110,7 @@ def test_a_file_that_is_no_curve_is_refused_in_a_line(tmp_path, monkeypatch) -> 
 
 def test_it_scores_what_was_measured_before_and_says_if_there_is_nothing(curves, tmp_path, monkeypatch) -> None:
     words = ["benchmark", str(tmp_path / "out"), "--gaps", "a", "b", "--methods", "good", "bad", "--score-only"]
+    words += ["--seeds", "0", "1", "2", "3"]
     monkeypatch.setattr("sys.argv", [*words, "--with", str(curves), "--at", "10", "20"])
     benchmark.main()
     with (tmp_path / "out" / "runs.csv").open() as file:
