@@ -16,6 +16,7 @@ PAGES = [
     "tutorials/first-gap.md",
     "tutorials/own-data.md",
     "tutorials/own-task.md",
+    "tutorials/own-method.md",
     "tutorials/robot-rehearsal.md",
     "benchmark.md",
 ]
