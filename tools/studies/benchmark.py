@@ -150,15 +150,16 @@ def better(rows: Sequence[dict[str, Any]], rollouts: int) -> list[dict[str, Any]
     methods, found = list(dict.fromkeys(row["method"] for row in rows)), []
     counts = Counter((row["method"], row["gap"]) for row in rows)
     most = {m: max(n for (method, _), n in counts.items() if method == m) for m in methods}
-    for pair in itertools.permutations(methods, 2):
-        gaps = [gap for gap in dict.fromkeys(r["gap"] for r in rows) if all(counts[m, gap] == most[m] for m in pair)]
-        if gaps:
-            scores = tuple(matrix(rows, method, gaps) for method in pair)
-            value, low, high = estimates({"pair": scores}, metrics.probability_of_improvement)["pair"]
-            found.append(
-                {"method": pair[0], "over": pair[1], "rollouts": rollouts, "gaps": " ".join(gaps)}
-                | {"probability": value, "low": low, "high": high}
-            )
+    for one, other in itertools.combinations(methods, 2):
+        gaps = [g for g in dict.fromkeys(r["gap"] for r in rows) if all(counts[m, g] == most[m] for m in (one, other))]
+        if not gaps:
+            continue
+        scores = matrix(rows, one, gaps), matrix(rows, other, gaps)
+        value, low, high = estimates({"pair": scores}, metrics.probability_of_improvement)["pair"]
+        turned = [round(1 - x, 4) for x in (value, high, low)]  # ties count half either way
+        for method, over, found_here in ((one, other, (value, low, high)), (other, one, turned)):
+            numbers = dict(zip(("probability", "low", "high"), found_here, strict=True))
+            found.append({"method": method, "over": over, "rollouts": rollouts, "gaps": " ".join(gaps)} | numbers)
     return found
 
 
