@@ -59,16 +59,21 @@ def on_robot_tasks() -> Curves:
 
 
 def drawn(curves: Curves, gaps: list[str], ylabel: str, columns: int = 4) -> Figure:
-    """A panel a gap, at most so many side by side."""
+    """A panel a gap, at most so many side by side, and one legend for all."""
     columns = min(columns, len(gaps))
     rows = -(-len(gaps) // columns)
-    figure, axes = plt.subplots(rows, columns, figsize=(4.2 * columns, 3.4 * rows), squeeze=False)
+    figure, axes = plt.subplots(rows, columns, figsize=(4.2 * columns, 3.4 * rows + 0.4), squeeze=False)
+    known = {}
     for axis, gap in zip(axes.flat, gaps, strict=False):
-        panel(axis, gap, curves[gap])
+        seeds = sorted({len(values) for points in curves[gap].values() for values in points.values()})
+        panel(axis, f"{gap}, seeds: {' to '.join(map(str, dict.fromkeys((seeds[0], seeds[-1]))))}", curves[gap])
         axis.set_ylabel(ylabel)
+        axis.get_legend().remove()
+        known |= dict(zip(curves[gap], axis.get_lines(), strict=True))
     for axis in list(axes.flat)[len(gaps) :]:
         axis.set_axis_off()
-    figure.tight_layout()
+    figure.tight_layout(rect=(0, 0, 1, 1 - 0.4 / figure.get_figheight()))
+    figure.legend(list(known.values()), list(known), loc="upper center", ncols=len(known), frameon=False)
     return figure
 
 

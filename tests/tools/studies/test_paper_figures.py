@@ -53,5 +53,7 @@ def test_sgft_must_beat_every_baseline_of_the_paper(monkeypatch) -> None:
 def test_there_is_a_panel_for_each_gap() -> None:
     found = curves(a={0: [0.0, 0.1]}, b={0: [0.0]}, c={0: [0.0]}, d={0: [0.0]}, e={0: [0.0]})
     figure = drawn(found, list(found), "success")
-    assert [axis.get_title() for axis in figure.axes if axis.axison] == list(found)
+    assert [axis.get_title().split(",")[0] for axis in figure.axes if axis.axison] == list(found)
+    assert figure.axes[0].get_title() == "a, seeds: 2"
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["sgft"]
     assert len(drawn(found, ["a"], "success").axes) == 1
