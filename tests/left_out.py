@@ -23,6 +23,7 @@ NEEDS = {  # what a test may need, and what brings it
     "MuJoCo Warp": "make setup",
     "submitit": "make setup",
     "rosbags": "make setup",
+    "rliable": "make setup",
     "PyBullet": "pip install -e '.[foreign]'",
     "Linux": "a Linux machine",
     "measured data": "MPC_SGFT_DATA=FOLDER",
