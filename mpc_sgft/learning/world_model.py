@@ -13,14 +13,13 @@ import torch
 from torch import Tensor, nn
 
 from mpc_sgft.learning.dynamics import Dynamics
+from mpc_sgft.learning.gaussian import gaussian_tanh, gaussian_tanh_log_prob
 from mpc_sgft.learning.layers import (
     Ensemble,
     Normalizer,
     SimNorm,
     TwoHot,
     by_blocks,
-    gaussian_tanh,
-    gaussian_tanh_log_prob,
     mlp,
 )
 from mpc_sgft.learning.observation_map import ObservationMap

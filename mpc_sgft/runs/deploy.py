@@ -103,8 +103,7 @@ class Deployment:
         self.transfer = make_transfer(cfg, agent, build.sensed(cfg), env.task.episode_steps)
         self.frozen = agent.frozen_hash()
         self.state: dict[str, Any] = {"rollouts": 0, "aborted": 0, "scores": {}, "seconds": 0.0, "successes": 0}
-        self.state |= {"interventions": 0, "rerecorded": 0}
-        self.state["updates"] = 0
+        self.state |= {"interventions": 0, "rerecorded": 0, "updates": 0}
         self.state["outcomes"] = []  # (success, return) of each real rollout
         if cfg.resume is not None:
             self._resume()

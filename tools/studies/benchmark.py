@@ -16,12 +16,11 @@ Precipice", NeurIPS 2021.
 """
 
 import argparse
-import csv
 import itertools
 import sys
 import warnings
-from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Sequence
+from collections import Counter
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,46 +28,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tools.studies import study
-from tools.studies.runner import write
+from tools.studies.runner import Runs, named, read_curves, write
 
 RUN = ["gap", "method", "seed", "rollouts", "before", "after", "area", "rollouts_to_90", "updates", "seconds"]
 SCORE = ["gap", "method", "rollouts", "runs", "median", "iqm", "low", "high"]
 BETTER = ["method", "over", "rollouts", "gaps", "probability", "low", "high"]
-NEEDED = {"gap", "method", "variant", "seed", "rollouts", "success"}
 RESAMPLES = 2000
 GOOD = 0.9  # success that a run is asked for
-Runs = dict[str, dict[str, dict[int, dict[int, dict[str, str]]]]]  # gap -> method -> seed -> rollouts -> row
 Scores = NDArray[np.float64]  # [runs, gaps]
-
-
-def read(paths: Iterable[Path]) -> Runs:
-    """Rows of curves as tools.studies.study writes them; a variant is part of a method's name (`named`).
-
-    Raises:
-        ValueError: If a file lacks a column, or two hold the same run.
-    """
-    runs: Runs = defaultdict(lambda: defaultdict(lambda: defaultdict(dict)))
-    for path in paths:
-        with path.open(newline="") as file:
-            table = csv.DictReader(file)
-            missing = NEEDED - set(table.fieldnames or [])
-            if missing:
-                raise ValueError(
-                    f"{path} has no column {', '.join(sorted(missing))}; curves have {', '.join(sorted(NEEDED))}"
-                )
-            for row in table:
-                method = named(row["method"], row["variant"])
-                curve, count = runs[row["gap"]][method][int(row["seed"])], int(row["rollouts"])
-                if count in curve:
-                    raise ValueError(
-                        f"{path}: {method} in {row['gap']}, seed {row['seed']}, is there twice; give it once"
-                    )
-                curve[count] = row
-    return runs
-
-
-def named(method: str, variant: str) -> str:
-    return f"{method} {variant}".strip()
 
 
 def summaries(runs: Runs, rollouts: int) -> list[dict[str, Any]]:
@@ -180,11 +147,11 @@ def main() -> None:
     curves = args.folder / "curves.csv"
     wanted = list(itertools.product(args.gaps, args.methods, args.variants, args.seeds))
     try:
-        there = read(args.measured)
+        there = read_curves(args.measured)
         if not args.score_only:
             known = {key for key in wanted if key[3] in there[key[0]][named(*key[1:3])]}
             study.run(curves, args, args.folder.name, known)
-        runs = read([*([curves] if curves.exists() else []), *args.measured])
+        runs = read_curves([*([curves] if curves.exists() else []), *args.measured])
     except (ValueError, FileNotFoundError) as error:
         sys.exit(f"error: {error}")
     chosen: Runs = {gap: {} for gap in args.gaps}

@@ -6,7 +6,6 @@ For the results page OUT.png is results/transfer/transfer.png. Takes seconds.
 """
 
 import argparse
-import csv
 from collections import defaultdict
 from pathlib import Path
 
@@ -17,6 +16,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 from scipy.stats import bootstrap
+
+from tools.studies.runner import read_curves
 
 COLOURS = {  # of a method in every figure
     "sgft": "#1f77b4",
@@ -34,23 +35,14 @@ COLOURS = {  # of a method in every figure
 Curves = dict[str, dict[str, dict[int, list[float]]]]  # gap -> label -> rollouts -> of each seed
 
 
-def read(paths: list[Path], column: str = "success") -> Curves:
-    """Success, or another column, of each seed.
-
-    Raises:
-        ValueError: If two files hold the same run.
-    """
+def values(paths: list[Path], column: str = "success") -> Curves:
+    """Success, or another column, of each seed."""
     curves: Curves = defaultdict(lambda: defaultdict(lambda: defaultdict(list)))
-    seen = set()
-    for path in paths:
-        with path.open() as file:
-            for row in csv.DictReader(file):
-                label = " ".join(x for x in (row["method"], row["variant"]) if x)
-                key = row["gap"], label, row["seed"], row["rollouts"]
-                if key in seen:
-                    raise ValueError(f"{path}: {label} in {row['gap']}, seed {row['seed']}, is there twice")
-                seen.add(key)
-                curves[row["gap"]][label][int(row["rollouts"])].append(float(row[column]))
+    for gap, methods in read_curves(paths).items():
+        for label, seeds in methods.items():
+            for curve in seeds.values():
+                for count, row in curve.items():
+                    curves[gap][label][count].append(float(row[column]))
     return curves
 
 
@@ -81,7 +73,7 @@ def main() -> None:
     parser.add_argument("csv", type=Path, nargs="+")
     parser.add_argument("png", type=Path)
     args = parser.parse_args()
-    curves = read(args.csv)
+    curves = values(args.csv)
     figure, axes = plt.subplots(1, len(curves), figsize=(4.2 * len(curves), 3.4), sharey=True, squeeze=False)
     for axis, (gap, methods) in zip(axes[0], curves.items(), strict=True):
         panel(axis, f"gap: {gap}", methods)

@@ -10,12 +10,15 @@ import json
 import os
 import subprocess
 import sys
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, TypeVar
 
 Job = TypeVar("Job")
+NEEDED = {"gap", "method", "variant", "seed", "rollouts", "success"}  # columns of learning curves
+Runs = dict[str, dict[str, dict[int, dict[int, dict[str, str]]]]]  # gap -> method -> seed -> rollouts -> row
 
 
 class RunFailed(Exception):
@@ -110,3 +113,33 @@ def measured(path: Path, columns: Sequence[str], keys: Sequence[dict[str, Any]],
         rows.append(work(**key))
         write(path, columns, rows)
         print(rows[-1], flush=True)
+
+
+def read_curves(paths: Iterable[Path]) -> Runs:
+    """Rows of curves as tools.studies.study writes them; a variant is part of a method's name (`named`).
+
+    Raises:
+        ValueError: If a file lacks a column, or two hold the same run.
+    """
+    runs: Runs = defaultdict(lambda: defaultdict(lambda: defaultdict(dict)))
+    for path in paths:
+        with path.open(newline="") as file:
+            table = csv.DictReader(file)
+            missing = NEEDED - set(table.fieldnames or [])
+            if missing:
+                raise ValueError(
+                    f"{path} has no column {', '.join(sorted(missing))}; curves have {', '.join(sorted(NEEDED))}"
+                )
+            for row in table:
+                method = named(row["method"], row["variant"])
+                curve, count = runs[row["gap"]][method][int(row["seed"])], int(row["rollouts"])
+                if count in curve:
+                    raise ValueError(
+                        f"{path}: {method} in {row['gap']}, seed {row['seed']}, is there twice; give it once"
+                    )
+                curve[count] = row
+    return runs
+
+
+def named(method: str, variant: str) -> str:
+    return f"{method} {variant}".strip()

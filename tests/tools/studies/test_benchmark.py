@@ -40,16 +40,16 @@ def curves(tmp_path) -> Path:
 
 
 def test_a_run_is_one_row_with_what_it_cost(curves) -> None:
-    rows = benchmark.summaries(benchmark.read([curves]), 20)
+    rows = benchmark.summaries(benchmark.read_curves([curves]), 20)
     assert len(rows) == 16, "new was not measured after twenty"
     first = rows[0]
     assert (first["before"], first["after"], first["rollouts_to_90"]) == (0.0, 1.0, 10)
     assert first["area"] == pytest.approx((4.5 + 9.5) / 20) and first["seconds"] == "7.5"
-    assert "seconds" not in benchmark.summaries(benchmark.read([curves]), 10)[0], "of the whole run alone"
+    assert "seconds" not in benchmark.summaries(benchmark.read_curves([curves]), 10)[0], "of the whole run alone"
 
 
 def test_the_interquartile_mean_is_that_of_the_middle_half(curves) -> None:
-    scores = benchmark.scored(benchmark.summaries(benchmark.read([curves]), 10), 10)
+    scores = benchmark.scored(benchmark.summaries(benchmark.read_curves([curves]), 10), 10)
     by = {(s["gap"], s["method"]): s for s in scores}
     assert by["a", "bad"]["iqm"] == pytest.approx(0.2) and by["a", "bad"]["median"] == pytest.approx(0.2)
     assert by["all", "bad"]["runs"] == 8 and ("all", "new") not in by, "new has no run in b"
@@ -87,7 +87,7 @@ def test_what_was_measured_before_is_not_run_again(curves, tmp_path, monkeypatch
 
 
 def test_who_is_probably_better(curves) -> None:
-    found = benchmark.better(benchmark.summaries(benchmark.read([curves]), 10), 10)
+    found = benchmark.better(benchmark.summaries(benchmark.read_curves([curves]), 10), 10)
     by = {(f["method"], f["over"]): f for f in found}
     assert by["good", "bad"]["probability"] == 1.0 and by["bad", "good"]["probability"] == 0.0
     assert by["good", "new"]["probability"] == 0.5, "ties count half"
@@ -96,7 +96,7 @@ def test_who_is_probably_better(curves) -> None:
 
 def test_a_run_given_twice_is_refused(curves) -> None:
     with pytest.raises(ValueError, match="is there twice"):
-        benchmark.read([curves, curves])
+        benchmark.read_curves([curves, curves])
 
 
 def test_a_file_that_is_no_curve_is_refused_in_a_line(tmp_path, monkeypatch) -> None:

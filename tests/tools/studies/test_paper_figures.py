@@ -50,6 +50,17 @@ def test_sgft_must_beat_every_baseline_of_the_paper(monkeypatch) -> None:
     assert verdict([*rows(every[1:]), *rows(every[:1], low="0.5")]) == NOT
 
 
+def test_the_horizon_matters_if_returns_differ_more_with_the_peg(monkeypatch) -> None:
+    def verdict(**ends: tuple[float, float]) -> str:
+        found = {gap: {f"H={i}": {0: [9.0], 10: [end]} for i, end in enumerate(both)} for gap, both in ends.items()}
+        monkeypatch.setattr(paper_figures, "values", lambda *_: found)
+        return paper_figures.horizon_matters({})[1]
+
+    assert verdict(sluggish=(0.0, 1.0)) == OPEN
+    assert verdict(rope_real=(10.0, 40.0), walker_real=(90.0, 100.0)) == CONFIRMED
+    assert verdict(rope_real=(38.0, 40.0), walker_real=(90.0, 100.0)) == NOT
+
+
 def test_there_is_a_panel_for_each_gap() -> None:
     found = curves(a={0: [0.0, 0.1]}, b={0: [0.0]}, c={0: [0.0]}, d={0: [0.0]}, e={0: [0.0]})
     figure = drawn(found, list(found), "success")
