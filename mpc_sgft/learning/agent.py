@@ -2,7 +2,8 @@
 
 import copy
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 import torch
@@ -200,9 +201,10 @@ class Agent:
             self._watch.check()
 
     def _update_policy(self, zs: Tensor, read: bool) -> dict[str, Tensor]:
-        action, log_prob = self.model.policy(zs, self.noise(*zs.shape[:-1]))
-        heads = self.two_heads()
-        q = self.model.q(zs, action, heads=heads)  # [2, T + 1, B]
+        noise, heads = self.noise(*zs.shape[:-1]), self.two_heads()
+        with self._constant_but_policy():
+            action, log_prob = self.model.policy(zs, noise)
+            q = self.model.q(zs, action, heads=heads)  # [2, T + 1, B]
         scale = self.scale.update(q.detach()[:, 0])
         coef = self.log_entropy_coef.detach().exp()
         loss = losses.over_time(losses.policy_loss(q, log_prob, coef, scale), self.rho)
@@ -220,7 +222,8 @@ class Agent:
         self, starts: Tensor, horizon: int, coef: Tensor | float, read: bool
     ) -> tuple[dict[str, Tensor], Tensor]:
         noise = self.noise(horizon, len(starts))
-        objective, log_prob = losses.imagined_objective(self.model, starts, noise, self.discount)
+        with self._constant_but_policy():
+            objective, log_prob = losses.imagined_objective(self.model, starts, noise, self.discount)
         scale = self.scale.update(objective.detach())
         metrics = self.step_policy(coef * log_prob.mean() - objective.mean() / scale, log_prob, read)
         return metrics | {"objective": objective.mean(), "scale": scale}, log_prob
@@ -230,7 +233,7 @@ class Agent:
         self._note({"policy_loss": loss}, read)
         parameters = list(self.model.policy_head.parameters())
         self.policy_optimizer.zero_grad()
-        loss.backward(inputs=parameters)  # the critics and the dynamics collect no gradient here
+        loss.backward(inputs=parameters)  # nothing else collects a gradient here
         torch.nn.utils.clip_grad_norm_(parameters, self.grad_clip, foreach=True)
         self.policy_optimizer.step()
         return {"policy_loss": loss, "entropy": -log_prob.mean()}
@@ -375,6 +378,19 @@ class Agent:
 
     def _optimizers(self) -> dict[str, torch.optim.Adam]:
         return {"model": self.model_optimizer, "policy": self.policy_optimizer, "entropy": self.entropy_optimizer}
+
+    @contextmanager
+    def _constant_but_policy(self) -> Iterator[None]:
+        """What is computed within has slopes for the policy prior alone: those of all else are never computed."""
+        parameters = self.model.named_parameters()
+        others = [p for name, p in parameters if p.requires_grad and not name.startswith("policy_head.")]
+        for parameter in others:
+            parameter.requires_grad_(False)
+        try:
+            yield
+        finally:
+            for parameter in others:
+                parameter.requires_grad_(True)
 
     def _trains(self, name: str) -> bool:
         return any(name.startswith(part + ".") for part in self.trainable)

@@ -2,11 +2,11 @@
 
     python -m tools.benchmarks.time_planner [--quick] [--sizes small 1M 5M] [--threads 1 2] [--out CSV]
 
-Everything is measured in this process. `share` is the arithmetic of all linear layers, divided by the best time and by
-the fp32 peak beside it, measured before and after the row. `cpu_ms` is processor time: on one thread it is what a quiet
-machine would take, and where it is far below the median the machine was busy. Two threads on busy cores wait for each
-other, and say nothing then. `decay` divides the candidates after each iteration. Upstream's figures were measured once,
-on cores of 95 GFLOP/s.
+Everything is measured in this process. `share` is the arithmetic of all matrix products, divided by the best time and
+by the fp32 peak beside it, measured before and after the row. `cpu_ms` is processor time: on one thread it is what a
+quiet machine would take, and where it is far below the median the machine was busy. Two threads on busy cores wait for
+each other, and say nothing then. `decay` divides the candidates after each iteration. Upstream's figures were measured
+once, on cores of 95 GFLOP/s.
 """
 
 import argparse
@@ -25,6 +25,7 @@ import torch
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 from tensordict import TensorDict
+from torch.utils.flop_counter import FlopCounterMode
 
 from mpc_sgft.learning.agent import Agent
 from mpc_sgft.learning.world_model import WorldModel
@@ -44,46 +45,6 @@ UPSTREAM_MS = {  # eager fp32 on a quiet AMD EPYC with AVX-512-BF16, (what, size
     ("plan", "1M", 4, 1): 375, ("plan", "5M", 4, 1): 959, ("plan", "1M", 4, 2): 200,
     ("update", "1M", 3, 1): 224, ("update", "5M", 3, 1): 788, ("update", "5M", 3, 2): 450,
 }  # fmt: skip
-
-
-def mlp_flop(*sizes: int) -> int:
-    """Multiplications and additions of a perceptron for one row."""
-    return 2 * sum(a * b for a, b in zip(sizes[:-1], sizes[1:], strict=True))
-
-
-def head_flop(model: WorldModel) -> dict[str, int]:
-    """Arithmetic of one row through each part of the model."""
-    s = model.sizes
-    d, m, a, bins = (int(s[k]) for k in ("latent_dim", "mlp_dim", "action_dim", "num_bins"))
-    return {
-        "encode": mlp_flop(int(s["obs_dim"]), *[int(s["enc_dim"])] * int(s["enc_layers"]), d),
-        "next": mlp_flop(d + a, m, m, d),
-        "reward": mlp_flop(d + a, m, m, bins),
-        "q": mlp_flop(d + a, m, m, bins),
-        "value": mlp_flop(d, m, m, bins),
-        "policy": mlp_flop(d, m, m, 2 * a),
-        "decode": mlp_flop(d, m, int(s["decode_dim"])),
-    }
-
-
-def plan_flop(model: WorldModel, planner: MPPI) -> int:
-    """Arithmetic of one plan: every candidate H steps and its V; those of the prior also ask the policy, once.
-
-    The first product of the dynamics on the latent that all candidates start from is not repeated for them.
-    """
-    f, p = head_flop(model), planner
-    drawn = sum(p.counts()) - p.iterations * p.num_prior
-    all_heads = (drawn + p.num_prior + 1) * (p.horizon * (f["next"] + f["reward"]) + f["value"])
-    shared = drawn * mlp_flop(int(model.sizes["latent_dim"]), int(model.sizes["mlp_dim"]))
-    return all_heads - shared + p.num_prior * p.horizon * f["policy"]
-
-
-def update_flop(model: WorldModel, steps: int) -> int:
-    """Arithmetic of one update on slices of `steps`: 1 forward, 3 with gradients, 2 with the input's alone."""
-    f, e = head_flop(model), model.num_q
-    first, every, later = 3 * f["encode"], 3 * (f["next"] + f["reward"] + e * f["q"]), f["encode"]
-    states = f["policy"] + e * f["q"] + 3 * f["value"] + 3 * f["decode"] + 3 * f["policy"] + 2 * 2 * f["q"]
-    return BATCH * (first + steps * (every + later) + (steps + 1) * states)
 
 
 def seconds(call: Callable[[], object], repeats: int) -> tuple[list[float], list[float]]:
@@ -116,15 +77,22 @@ def random_batch(obs_dim: int, action_dim: int, steps: int) -> TensorDict:
     return TensorDict({**now, "next": TensorDict(following, shape)}, shape)
 
 
-def jobs(size: str, precision: str, many: bool) -> list[tuple[str, int, float, int, int, Callable[[], object]]]:
-    """(what, horizon, decay, rows, flop, call) of all that is timed for a model; `many` plans 100 environments too."""
+def flop(call: Callable[[], object]) -> int:
+    """Multiplications and additions in the matrix products of one call."""
+    with FlopCounterMode(display=False) as counted:
+        call()
+    return int(counted.get_total_flops())
+
+
+def jobs(size: str, precision: str, many: bool) -> list[tuple[str, int, float, int, Callable[[], object]]]:
+    """(what, horizon, decay, rows, call) of all that is timed for a model; `many` plans 100 environments too."""
     obs_dim, action_dim = SPACES.get(size, UPSTREAM)
     sizes = {"obs_dim": obs_dim, "action_dim": action_dim, "decode_dim": min(obs_dim, 12)}
     model: WorldModel = instantiate(OmegaConf.load(ROOT / f"configs/model/{size}.yaml"), **sizes)
     train = OmegaConf.load(ROOT / "configs/train/default.yaml")
     whole = {"policy_delay": 1}  # every update has every part, as upstream's
     agent: Agent = instantiate(train.agent, model=model, discount=0.99, precision=precision, **whole)
-    out: list[tuple[str, int, float, int, int, Callable[[], object]]] = []
+    out: list[tuple[str, int, float, int, Callable[[], object]]] = []
     for horizon in (3, 4):
         for decay in DECAYS if horizon == 4 else (1.0,):
             numbers = {"action_dim": action_dim, "horizon": horizon, "precision": precision, "candidate_decay": decay}
@@ -132,9 +100,9 @@ def jobs(size: str, precision: str, many: bool) -> list[tuple[str, int, float, i
             for envs in (1, 100) if many and size == "small" and horizon == 4 else (1,):
                 act, fresh = planner_policy(model, planner, seed=0), torch.ones(envs, dtype=torch.bool)
                 act = partial(act, torch.randn(envs, obs_dim), fresh)
-                out.append(("plan", horizon, decay, envs, envs * plan_flop(model, planner), act))
+                out.append(("plan", horizon, decay, envs, act))
         batch = random_batch(obs_dim, action_dim, horizon)
-        out.append(("update", horizon, 1.0, BATCH, update_flop(model, horizon), lambda b=batch: agent.update(b)))
+        out.append(("update", horizon, 1.0, BATCH, lambda b=batch: agent.update(b)))
     return out
 
 
@@ -158,8 +126,8 @@ def measure(
     for count in threads:
         torch.set_num_threads(count)
         for size, precision in itertools.product(sizes, precisions):
-            for what, horizon, decay, batch, flop, call in jobs(size, precision, many=repeats > 3):
-                before = peak_gflops(repeats)
+            for what, horizon, decay, batch, call in jobs(size, precision, many=repeats > 3):
+                work, before = flop(call), peak_gflops(repeats)
                 wall, cpu = seconds(call, repeats if batch != 100 else max(2, repeats // 5))
                 peak = max(before, peak_gflops(repeats))
                 theirs = UPSTREAM_MS.get((what, size, horizon, count))
@@ -167,11 +135,11 @@ def measure(
                 row |= {"decay": decay if what == "plan" else "", "rows": batch, "threads": count}
                 row |= {"median_ms": round(median(wall) * 1e3, 1), "best_ms": round(min(wall) * 1e3, 1)}
                 row |= {"cpu_ms": round(median(cpu) * 1e3, 1), "peak_gflops": round(peak, 1)}
-                row |= {"share_of_peak": round(flop / min(wall) / 1e9 / peak, 3), "upstream_ms": theirs}
+                row |= {"share_of_peak": round(work / min(wall) / 1e9 / peak, 3), "upstream_ms": theirs}
                 row |= {"ratio_to_upstream": round(median(wall) * 1e3 / theirs, 2) if theirs else None}
                 print("".join(f"{'' if x is None else x:>10}" for x in row.values()), flush=True)
                 theirs_peak = UPSTREAM_PEAK[count] if theirs else None
-                row |= {"gflop": round(flop / 1e9, 3), "upstream_peak_gflops": theirs_peak, "repeats": len(wall)}
+                row |= {"gflop": round(work / 1e9, 3), "upstream_peak_gflops": theirs_peak, "repeats": len(wall)}
                 rows.append(row | machine)
     return rows
 

@@ -6,6 +6,7 @@ import pytest
 import torch
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from torch.testing import assert_close
+from torch.utils.flop_counter import FlopCounterMode
 
 from mpc_sgft.learning.agent import Agent
 from mpc_sgft.learning.world_model import PARTS
@@ -38,6 +39,20 @@ def test_an_update_in_bfloat16_goes_the_way_of_float32_and_keeps_its_weights_in_
         right, near = exact.update(batch), rounded.update(batch)
     assert near["loss"] != right["loss"] and near["loss"] == pytest.approx(right["loss"], rel=0.02)
     assert {p.dtype for p in rounded.model.parameters()} == {torch.float32}
+
+
+@pytest.mark.parametrize("imagined_steps", [0, 2])
+def test_an_update_computes_no_slope_that_nobody_asks_for(imagined_steps):
+    """What rounds its products would: an operation of our own does not know which slopes a backward pass leaves out."""
+    counts = []
+    for precision in ("float32", "bfloat16"):
+        agent = make_agent(precision=precision)
+        agent.imagined_steps = imagined_steps
+        with FlopCounterMode(display=False) as counted:
+            agent.update(make_batch())
+        counts.append(counted.get_total_flops())
+        assert all(p.requires_grad for p in agent.model_parameters)
+    assert counts[0] == counts[1]
 
 
 @pytest.mark.parametrize("terminated", [False, True])
