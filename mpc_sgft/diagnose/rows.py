@@ -12,7 +12,7 @@ from mpc_sgft.diagnose.data.measured import Array
 from mpc_sgft.diagnose.fitting import judge
 from mpc_sgft.diagnose.fitting.hypothesis import Hypothesis, without_effect
 from mpc_sgft.diagnose.fitting.prepare import Setup
-from mpc_sgft.diagnose.verdict.naming import effect_probability, intervals
+from mpc_sgft.diagnose.verdict.naming import effect_probability
 from mpc_sgft.diagnose.verdict.relevance import Relevance, by_window, foretold, mean_error
 from mpc_sgft.diagnose.verdict.tolerance import Predict
 from mpc_sgft.diagnose.verdict.verdict import Verdict
@@ -45,11 +45,10 @@ def effect_rows(
 ) -> list[dict[str, Any]]:
     """What the report says of each named effect, those that would be missed most first."""
     best, out = verdict.best, []
-    bounds = intervals(best)
     wins = effect_probability(best, hypotheses, verdict.probability)
     changes = changes_of(setup, best, hypotheses, shown.predict)
     for term, value, (low, high), win, s, change in zip(
-        best.terms, best.values, bounds, wins, verdict.shares, changes, strict=True
+        best.terms, best.values, verdict.intervals, wins, verdict.shares, changes, strict=True
     ):
         row = _row(s, value, change, shown)
         lows, highs = (effect_parameters(term.effect, term.names, x) for x in (low, high))

@@ -1,4 +1,4 @@
-"""Which set of effects the data call for, what ties with it, and how sure its numbers are."""
+"""Which set of effects the data call for, and what ties with it."""
 
 from __future__ import annotations
 
@@ -10,14 +10,13 @@ from scipy import stats
 
 from mpc_sgft.diagnose.candidates.effect_table import EQUIVALENT, Equivalence
 from mpc_sgft.diagnose.candidates.library import IDLE_WHILE_NEUTRAL
-from mpc_sgft.diagnose.data.measured import Array
 from mpc_sgft.diagnose.fitting import judge
 from mpc_sgft.diagnose.fitting.fit import Fit
 from mpc_sgft.diagnose.fitting.hypothesis import Hypothesis, holds, without_effect
 from mpc_sgft.diagnose.fitting.prepare import ABOVE_NOISE, NOISE, Setup
+from mpc_sgft.diagnose.verdict.uncertainty import intervals, standard_deviations
 
 NEAREST = 8  # rivals that are simulated to see whether they foretell the same
-WIDER = 1.3  # of intervals: what windows that begin at each other's ends share; set on development seeds
 
 
 def choose(setup: Setup[Any], hypotheses: list[Hypothesis], rng: np.random.Generator) -> Hypothesis:
@@ -188,35 +187,6 @@ def canonical(
 def settled(best: Hypothesis) -> bool:
     """Whether a set leaves nothing that is worth a further name."""
     return best.error < NOISE + ABOVE_NOISE
-
-
-def standard_deviations(f_entry: Hypothesis) -> list[Array]:
-    """Standard deviations of each term's parameters: the wider of the model's and the windows' own scatter.
-
-    The first takes residuals as white, the second (a sandwich over windows) lets each window have its own error.
-    """
-    f = f_entry.fit
-    count = f.J.shape[-1]
-    if not count:
-        return []
-    weight = f.weights
-    A = np.einsum("w,wmp,wmq->pq", weight, f.J, f.J, optimize=True)
-    inverse = np.linalg.pinv(A + 1e-12 * np.eye(count) * max(float(np.trace(A)), 1e-30))
-    white = np.diag(inverse) * max(1.0, float(weight @ (f.r**2).mean(1) / weight.sum()))
-    scores = np.einsum("w,wmp,wm->wp", weight, f.J, f.r, optimize=True)
-    windows = np.diag(inverse @ (scores.T @ scores) @ inverse)
-    sd = WIDER * np.sqrt(np.maximum(white, windows))
-    ends = np.cumsum([len(t.size) for t in f.terms])
-    return [x * t.size for x, t in zip(np.split(sd, ends[:-1]), f.terms, strict=True)]
-
-
-def intervals(f_entry: Hypothesis, level: float = 0.90) -> list[tuple[Array, Array]]:
-    """Low and high of each effect's parameters."""
-    f = f_entry.fit
-    half = float(stats.t.ppf(0.5 + level / 2, max(len(f.r) - 1, 1)))
-    rows = zip(f.terms, f.values, standard_deviations(f_entry), strict=True) if f.terms else ()
-    bounds = [(np.maximum(v - half * sd, t.low), np.minimum(v + half * sd, t.high)) for t, v, sd in rows]
-    return bounds[len(f.terms) - f_entry.effects :]
 
 
 def effect_probability(

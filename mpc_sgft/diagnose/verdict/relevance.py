@@ -26,8 +26,8 @@ from mpc_sgft.diagnose.fitting import judge
 from mpc_sgft.diagnose.fitting.fit import OUTLYING
 from mpc_sgft.diagnose.fitting.hypothesis import Hypothesis, holds, without_effect
 from mpc_sgft.diagnose.fitting.prepare import Setup
-from mpc_sgft.diagnose.verdict.naming import intervals
 from mpc_sgft.diagnose.verdict.tolerance import Tolerance
+from mpc_sgft.diagnose.verdict.uncertainty import intervals
 
 MATTERS = 0.01  # of the nominal model's squared error, a tenth of its root mean square: what is less is a trace
 

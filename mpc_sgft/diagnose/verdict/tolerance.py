@@ -21,6 +21,7 @@ FITTING = {  # unit of a signal -> those that a tolerance may be given in
     "rad/s": ("rad/s", "deg/s"),
     "N or N m": ("N", "mN", "Nm", "mNm"),
 }
+TIED = 0.5  # of what the user tolerates: what foretells the same but for less is alike, whatever the data say of it
 SMALL = 0.01  # of a signal's standard deviation: what changes predictions by less may be a trace if nobody says
 
 
@@ -51,9 +52,18 @@ class Tolerance:
 
     def alike(self, a: Fit, b: Fit, told: Array, times: float = 1.0) -> bool:
         """Whether two fits predict the same but for so many times the tolerance, on windows of these weights [W]."""
-        one, other = self.predict([a, b])
-        apart = np.einsum("w,wns->s", told, (one - other) ** 2) / one[..., 0].size
-        return bool((apart <= (times * self.limits) ** 2).all())
+        return bool(self.shares([a, b], told)[0] <= times)
+
+    def shares(self, fits: Sequence[Fit], told: Array) -> Array:
+        """How far the first fit and each other predict apart, in tolerances of the worst signal, [K - 1].
+
+        Args:
+            fits: K of them.
+            told: Weights of windows, [W].
+        """
+        y = self.predict(fits)
+        apart = np.einsum("w,kwns->ks", told, (y[1:] - y[:1]) ** 2) / y[0, ..., 0].size
+        return np.sqrt((apart / self.limits**2).max(-1))
 
 
 def parse_tolerance(text: str) -> float | dict[str, str]:

@@ -22,9 +22,9 @@ from mpc_sgft.diagnose.verdict.relevance import (
     shares_of,
     what_matters,
 )
-from mpc_sgft.diagnose.verdict.tolerance import Tolerance
+from mpc_sgft.diagnose.verdict.tolerance import TIED, Tolerance
+from mpc_sgft.diagnose.verdict.uncertainty import Interval, tolerant_intervals
 
-TIED = 0.5  # of what the user tolerates: sets that foretell the same but for less tie, whatever the data say of them
 LEFT = 0.1  # share of the squared error above noise that names may leave
 
 
@@ -40,6 +40,7 @@ class Verdict(NamedTuple):
         there: The set of all that is credibly there, traces too.
         shares: What each effect of the best set does beyond the others.
         traces: Effects that are there and do not matter, largest first.
+        intervals: Of the best set's parameters, effect by effect.
     """
 
     kind: str
@@ -50,6 +51,7 @@ class Verdict(NamedTuple):
     there: Hypothesis
     shares: list[Relevance]
     traces: list[Relevance]
+    intervals: list[Interval]
 
 
 def reach_verdict(
@@ -100,7 +102,8 @@ def reach_verdict(
         if open_ties:
             reason = f"{_list(best)} and {len(open_ties)} others tie"
     shares = shares_of(setup, best, there, hypotheses, rng)
-    return Verdict(kind, best, named, probability, reason, there, shares, traces)
+    sure = tolerant_intervals(best, tolerance, told)
+    return Verdict(kind, best, named, probability, reason, there, shares, traces, sure)
 
 
 def _no_name(

@@ -11,8 +11,9 @@ from mpc_sgft.diagnose.fitting.fit import fit
 from mpc_sgft.diagnose.fitting.hypothesis import Hypothesis, judge_fit
 from mpc_sgft.diagnose.fitting.prepare import Setup
 from mpc_sgft.diagnose.fitting.residual_model import ResidualModel
-from mpc_sgft.diagnose.verdict.naming import find_ties, gains, intervals
+from mpc_sgft.diagnose.verdict.naming import find_ties, gains
 from mpc_sgft.diagnose.verdict.relevance import certain
+from mpc_sgft.diagnose.verdict.uncertainty import intervals
 from mpc_sgft.diagnose.verdict.verdict import reach_verdict
 from tests.mpc_sgft.diagnose.lines import Lines, motion, term
 

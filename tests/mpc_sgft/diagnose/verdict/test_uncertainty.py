@@ -1,0 +1,62 @@
+"""How wide intervals are, on a problem made by hand."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mpc_sgft.diagnose.data.measured import Array
+from mpc_sgft.diagnose.fitting.fit import fit
+from mpc_sgft.diagnose.fitting.hypothesis import Hypothesis, judge_fit
+from mpc_sgft.diagnose.fitting.prepare import Setup
+from mpc_sgft.diagnose.verdict.tolerance import TIED
+from mpc_sgft.diagnose.verdict.uncertainty import indistinct, intervals, tolerant_intervals
+from tests.mpc_sgft.diagnose.lines import Lines, motion, term
+
+EVEN = np.ones(24)
+
+
+def rms(x: Array) -> float:
+    return float(np.sqrt((x**2).mean()))
+
+
+def fitted_lines(names: str, problem: Lines) -> Hypothesis:
+    """A set of lines of weight one each, fitted to their sum with noise."""
+    fitted, none = np.arange(18), np.zeros(1)
+    problem.y = sum(problem.columns[n] for n in names) + np.random.default_rng(1).normal(size=problem.y.shape)
+    setup = Setup(problem, fitted, np.arange(18, 24), fitted // 3, fit(problem, [], [], fitted), none, none)
+    return judge_fit(setup, fit(problem, [term(n) for n in names], [np.ones(1)] * len(names), fitted))
+
+
+def test_a_parameter_goes_as_far_as_half_of_the_tolerance_lets_it() -> None:
+    problem = Lines()
+    one = fitted_lines("a", problem)
+    tolerance = motion(problem, 0.02, asked=True)
+    by_hand = TIED * float(tolerance.limits[0]) / rms(problem.columns["a"])
+    assert indistinct(one.fit, tolerance, EVEN) == pytest.approx(by_hand, rel=1e-6)
+    (low,), (high,) = tolerant_intervals(one, tolerance, EVEN)[0]
+    (least,), (most,) = intervals(one)[0]
+    assert high - low == pytest.approx(2 * np.hypot((most - least) / 2, by_hand), rel=1e-6)
+
+
+def test_parameters_that_make_up_for_each_other_go_further() -> None:
+    """b = a + 0.2 h: weights that move against each other change predictions by 0.2 h alone, about."""
+    problem = Lines()
+    c = problem.columns
+    c["b"] = c["a"] + 0.2 * c["h"]
+    both, tolerance = fitted_lines("ab", problem), motion(problem, 0.02, asked=True)
+    least = min(rms(c["a"] * x - c["b"]) for x in np.linspace(0.5, 1.5, 2001))  # for a change of b by one
+    reach = indistinct(both.fit, tolerance, EVEN)
+    assert reach[1] == pytest.approx(TIED * float(tolerance.limits[0]) / least, rel=0.1)
+    assert reach[1] > 3 * TIED * float(tolerance.limits[0]) / rms(c["b"])
+
+
+def test_what_nobody_tolerates_widens_nothing() -> None:
+    problem = Lines()
+    one = fitted_lines("a", problem)
+    assert tolerant_intervals(one, motion(problem, 0.02, asked=False), EVEN) == intervals(one)
+    unseen = replace(motion(problem, 0.02, asked=True), limits=np.array([np.inf]))
+    (low,), (high,) = tolerant_intervals(one, unseen, EVEN)[0]
+    assert (low, high) == (one.terms[0].low, one.terms[0].high)  # any error will do, and so will any value
