@@ -18,6 +18,9 @@ TASKS = ("hammer", "insert", "push_towel", "push_ball", "rope_peg_in_hole")
 BEGIN, END = "<!-- headline:begin -->", "<!-- headline:end -->"
 
 
+ROUNDED = ("episodes", "success", "low", "high")
+
+
 def pretrain() -> str:
     head = {
         "seed": "seed",
@@ -26,10 +29,12 @@ def pretrain() -> str:
         "low": ("success_low", tenth),
     }
     head |= {"high": ("success_high", tenth), "prior": ("prior_success", percent), "minutes": ("wall_seconds", minutes)}
-    return "\n\n".join(
+    parts = [
         f"{name}\n\n{pick(read(f'pretrain/{file}.csv'), head)}"
         for name, file in (("From scratch:", "pretrain"), ("The second stage (`+experiment=polish`):", "polish"))
-    )
+    ]
+    rounded = {"model": "model", "updates in": "precision"} | {k: v for k, v in head.items() if k in ROUNDED}
+    return "\n\n".join([*parts, "A wide model:", pick(read("pretrain/precision.csv"), rounded | {"return": "return"})])
 
 
 NAMED = {"gap": "gap", "seed": "seed", "effect": "effect", "parameter": "parameter", "value": ("value", digits)}
@@ -181,8 +186,14 @@ def timing() -> str:
     diagnose = {"what": "what", "s of data": "seconds_of_data", "names": "names", "wall s": "wall_s", "per unit": "per"}
     env = {"task": "task", "what": "what", "physics steps / s": "physics_steps_per_s"}
     env |= {"control steps / s": "control_steps_per_s", "ControlEnv / this": "control_env_over_this"}
-    pairs = (("time_planner", plan), ("candidate_decay", plan), ("time_diagnose", diagnose), ("benchmark_env", env))
+    pairs = (("time_planner", plan), ("time_diagnose", diagnose), ("benchmark_env", env))
     parts = [pick(read(f"timing/{file}.csv"), columns) for file, columns in pairs]
+    floor = {"what": "what", "size": "size", "precision": "precision", "GFLOP": "gflop", "GB": "gbyte"}
+    floor |= {"peak GFLOP/s": "peak_gflops", "peak GB/s": "peak_gbyte", "least ms": "floor_ms", "best ms": "best_ms"}
+    least = pick(read("timing/roofline.csv"), floor)
+    ways = {"size": "size", "critics": "members", "one by one [ms]": "loop_ms", "as one product [ms]": "batched_ms"}
+    critics = pick(read("timing/time_ensemble.csv"), ways)
+    parts += ["The least time that arithmetic and memory leave:", least, "Critics in an update:", critics]
     profile = {name: name for name in ("size", "precision", "operation", "ms", "calls")}
     large = [row for row in read("timing/profile_update.csv") if float(row["share"]) >= 0.03]
     shares = pick(large, {**profile, "share": ("share", percent)})

@@ -8,6 +8,7 @@ import torch
 from scipy.stats import binomtest
 from tensordict import TensorDict
 from torch import Tensor
+from tqdm import tqdm
 
 from envs.env import ControlEnv
 from mpc_sgft.learning.world_model import WorldModel
@@ -54,6 +55,17 @@ def collect(env: ControlEnv, act: Act, *, seed: int, first_episode: int = 0) -> 
         episode[fresh] = following + torch.arange(int(fresh.sum()))
         following += int(fresh.sum())
     return cast(TensorDict, TensorDict.stack(rows, 1))
+
+
+def shown(act: Act, bar: tqdm) -> Act:
+    """The same policy; a progress bar counts its steps."""
+
+    def counted(observation: Tensor, fresh: Tensor) -> Tensor:
+        action = act(observation, fresh)
+        bar.update()
+        return action
+
+    return counted
 
 
 def score(episodes: TensorDict) -> Score:

@@ -8,9 +8,10 @@ from tensordict import TensorDict
 
 from mpc_sgft.command.errors import UserError, from_config
 from mpc_sgft.runs import build
-from mpc_sgft.runs.collect import Act, collect, planner_policy, random_policy, score, scripted_policy
+from mpc_sgft.runs.collect import Act, collect, planner_policy, random_policy, score, scripted_policy, shown
 from mpc_sgft.runs.pretrain import EVAL_SEED
 from mpc_sgft.storage import run_folder
+from mpc_sgft.storage.metrics import progress
 
 CHUNK = 100  # episodes side by side
 
@@ -25,7 +26,9 @@ def evaluate(cfg: DictConfig) -> int:
     act = _policy(cfg, env)
     folder = run_folder.start(cfg)
     build.prepare_process(cfg)
-    parts = [collect(env, act, seed=EVAL_SEED + cfg.seed + i) for i in range(cfg.episodes // env.batch_size[0])]
+    rounds = cfg.episodes // env.batch_size[0]
+    with progress(rounds * env.task.episode_steps, desc="evaluate", disable=cfg.quiet) as bar:
+        parts = [collect(env, shown(act, bar), seed=EVAL_SEED + cfg.seed + i) for i in range(rounds)]
     result = score(cast(TensorDict, TensorDict.cat(parts)))
     summary = {
         "task": cfg.chosen.task,

@@ -18,7 +18,7 @@ from envs.env import ControlEnv
 from mpc_sgft.command.errors import Stopped, UserError, from_config
 from mpc_sgft.learning.agent import Agent
 from mpc_sgft.runs import build
-from mpc_sgft.runs.collect import Act, collect, planner_policy, score
+from mpc_sgft.runs.collect import Act, collect, planner_policy, score, shown
 from mpc_sgft.runs.explore import Collected, Round, policy_weights
 from mpc_sgft.storage import checkpoint, run_folder
 from mpc_sgft.storage.metrics import MetricLogger, progress
@@ -126,9 +126,10 @@ def pretrain(cfg: DictConfig) -> int:
     final_judge = build.make_env(cfg, cfg.final_episodes, randomised=True)
     planner = build.make_planner(cfg, judge.action_dim)
     torch.set_num_threads(max(cfg.torch_threads, cores()))  # nothing else works now
-    with watch("evaluate"):
-        final = score(collect(final_judge, prior(agent), seed=EVAL_SEED + 1))
-        planned = score(collect(final_judge, planner_policy(agent.averaged, planner, cfg.seed), seed=EVAL_SEED + 1))
+    policies = prior(agent), planner_policy(agent.averaged, planner, cfg.seed)
+    steps = len(policies) * final_judge.task.episode_steps
+    with watch("evaluate"), progress(steps, desc="evaluate", disable=cfg.quiet) as bar:
+        final, planned = (score(collect(final_judge, shown(act, bar), seed=EVAL_SEED + 1)) for act in policies)
     torch.set_num_threads(cfg.torch_threads)
     summary = {
         "task": cfg.chosen.task,

@@ -168,7 +168,8 @@ def test_evaluate_reports_an_interval(pretrained, tmp_path):
 
 
 def test_the_scripted_pendulum_swings_up(tmp_path):
-    done = run("evaluate", "policy=scripted", f"run_dir={tmp_path / 'e'}", "episodes=40")
+    done = run("evaluate", "policy=scripted", f"run_dir={tmp_path / 'e'}", "episodes=40", "quiet=false")
+    assert "evaluate: 100%" in done.stderr
     assert json.loads(done.stdout.splitlines()[-1])["success"] >= 0.95
 
 
