@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mpc_sgft.diagnose.candidates.effect_table import INCLUDES
-from mpc_sgft.diagnose.candidates.library import Term, includes
+from mpc_sgft.diagnose.candidates.library import Term, includes, simplify
 from mpc_sgft.diagnose.data.measured import Array
 from mpc_sgft.diagnose.fitting.fit import Fit, by_parts, fit, left_out_errors, window_errors
 from mpc_sgft.diagnose.fitting.prepare import Setup
@@ -91,11 +91,32 @@ def holds(rich: Hypothesis, simple: Hypothesis) -> bool:
 def without_effect(setup: Setup[Any], e: Hypothesis, i: int, hypotheses: list[Hypothesis]) -> Hypothesis:
     """A set without its i-th effect, as it was fitted, or fitted now from where the others are."""
     drop = len(e.fit.terms) - e.effects + i
-    terms = [t for k, t in enumerate(e.fit.terms) if k != drop]
-    key = frozenset(t.label + str(t.fixed) for t in terms[len(terms) - e.effects + 1 :])
+    terms, values = ([*x[:drop], *x[drop + 1 :]] for x in (e.fit.terms, e.fit.values))
+    return _fitted(setup, terms, values, e.effects - 1, hypotheses)
+
+
+def simpler(setup: Setup[Any], e: Hypothesis, hypotheses: list[Hypothesis]) -> list[Hypothesis]:
+    """The sets with an effect in place of one that includes it, as they were fitted, or fitted now.
+
+    Simpler effects are those of sets that were fitted.
+    """
+    known = {t.label: t for h in hypotheses for t in h.terms if t.label not in e.names}
+    out, first = [], len(e.fit.terms) - e.effects
+    for i, rich in enumerate(e.terms, first):
+        for term in (t for t in known.values() if includes(rich, t)):
+            terms = [*e.fit.terms[:i], term, *e.fit.terms[i + 1 :]]
+            values = [*e.fit.values[:i], simplify(rich, e.fit.values[i], term), *e.fit.values[i + 1 :]]
+            out.append(_fitted(setup, terms, values, e.effects, hypotheses))
+    return out
+
+
+def _fitted(
+    setup: Setup[Any], terms: list[Term], values: list[Array], effects: int, hypotheses: list[Hypothesis]
+) -> Hypothesis:
+    """A set as it was fitted, or fitted now from these values; it joins `hypotheses` then."""
+    key = frozenset(t.label + str(t.fixed) for t in terms[len(terms) - effects :])
     there = next((h for h in hypotheses if h.key == key), None)
     if there is None:
-        values = [v for k, v in enumerate(e.fit.values) if k != drop]
         there = judge_fit(setup, fit(setup.problem, terms, values, setup.fitted))
         hypotheses.append(there)
     return there

@@ -15,7 +15,6 @@ explained (eta squared) and 0.01 as a small one of it, Cohen 1988, chapter 8.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,7 +23,7 @@ from mpc_sgft.diagnose.candidates.library import IDLE_WHILE_NEUTRAL, Term
 from mpc_sgft.diagnose.data.measured import Array
 from mpc_sgft.diagnose.fitting import judge
 from mpc_sgft.diagnose.fitting.fit import OUTLYING
-from mpc_sgft.diagnose.fitting.hypothesis import Hypothesis, holds, without_effect
+from mpc_sgft.diagnose.fitting.hypothesis import Hypothesis, simpler, without_effect
 from mpc_sgft.diagnose.fitting.prepare import Setup
 from mpc_sgft.diagnose.verdict.tolerance import Tolerance
 from mpc_sgft.diagnose.verdict.uncertainty import intervals
@@ -72,10 +71,10 @@ def what_matters(
             traces.append(shares[i])
             best = without
             continue
-        simpler = simplest(setup, best, hypotheses, told, spare)
-        if simpler is best:
+        less = simplest(setup, best, hypotheses, told, spare)
+        if less is best:
             break
-        best = simpler
+        best = less
     return best, sorted(traces, key=lambda s: -s.share)
 
 
@@ -137,10 +136,10 @@ def mean_error(setup: Setup[Any], e: Hypothesis, told: Array) -> float:
 
 
 def simplest(
-    setup: Setup[Any], best: Hypothesis, hypotheses: Sequence[Hypothesis], told: Array, spare: float
+    setup: Setup[Any], best: Hypothesis, hypotheses: list[Hypothesis], told: Array, spare: float
 ) -> Hypothesis:
     """The set with one effect in place of one that includes it, if it leaves at most `spare` more of squared error."""
     enough = mean_error(setup, best, told) + spare
-    alike = (e for e in hypotheses if e.effects == best.effects and e.complexity < best.complexity)
-    simpler = [e for e in alike if holds(best, e) and mean_error(setup, e, told) <= enough]
-    return min(simpler, key=lambda e: (e.complexity, e.error), default=best)
+    alike = (e for e in simpler(setup, best, hypotheses) if e.complexity < best.complexity)
+    enough_told = [e for e in alike if mean_error(setup, e, told) <= enough]
+    return min(enough_told, key=lambda e: (e.complexity, e.error), default=best)

@@ -21,7 +21,6 @@ FITTING = {  # unit of a signal -> those that a tolerance may be given in
     "rad/s": ("rad/s", "deg/s"),
     "N or N m": ("N", "mN", "Nm", "mNm"),
 }
-TIED = 0.5  # of what the user tolerates: what foretells the same but for less is alike, whatever the data say of it
 SMALL = 0.01  # of a signal's standard deviation: what changes predictions by less may be a trace if nobody says
 
 

@@ -2,8 +2,8 @@
 
 The first is statistical and shrinks with the data. A model's other flaws do not: they move an estimate by as much as
 its own effect could make up for. Where the user says what prediction error does not matter, intervals also hold the
-parameters that differ by less than half of it, the others moving along: nothing could tell them apart but errors that
-the user does not care about.
+parameters that differ by less than that, the others moving along: nothing could tell them apart but errors that the
+user does not care about.
 
 Source: calibration with a model discrepancy, Kennedy and O'Hagan 2001 (10.1111/1467-9868.00294); that it cannot be told
 from the parameters without prior knowledge of it, Brynjarsdottir and O'Hagan 2014 (10.1088/0266-5611/30/11/114007).
@@ -17,7 +17,7 @@ from scipy import stats
 from mpc_sgft.diagnose.data.measured import Array
 from mpc_sgft.diagnose.fitting.fit import Fit
 from mpc_sgft.diagnose.fitting.hypothesis import Hypothesis
-from mpc_sgft.diagnose.verdict.tolerance import TIED, Tolerance
+from mpc_sgft.diagnose.verdict.tolerance import Tolerance
 
 WIDER = 1.3  # of intervals: what windows that begin at each other's ends share; set on development seeds
 STEP = 0.02  # in typical sizes, of the parameter that moves most, to see how predictions move
@@ -45,7 +45,7 @@ def intervals(e: Hypothesis, level: float = 0.90) -> list[Interval]:
 
 
 def tolerant_intervals(e: Hypothesis, tolerance: Tolerance, told: Array, level: float = 0.90) -> list[Interval]:
-    """`intervals`, and with them what differs by less than half of what the user tolerates, as squares add up.
+    """`intervals`, and with them what differs by no more than the user tolerates, as squares add up.
 
     Args:
         e: The set.
@@ -61,7 +61,7 @@ def tolerant_intervals(e: Hypothesis, tolerance: Tolerance, told: Array, level: 
 
 
 def indistinct(f: Fit, tolerance: Tolerance, told: Array) -> Array:
-    """How far each parameter can go, in typical sizes, until predictions differ by half of the tolerance, [P].
+    """How far each parameter can go, in typical sizes, until predictions differ by the tolerance, [P].
 
     The other parameters go along so that the predictions differ least: along a column of the inverse of J'J. To first
     order, from one step of each.
@@ -76,8 +76,7 @@ def indistinct(f: Fit, tolerance: Tolerance, told: Array) -> Array:
         there = max((ahead, back), key=lambda x, i=i: abs(x[i] - here[i]))  # away from a bound
         moved.append(f._replace(values=tuple(np.split(there, np.cumsum([len(t.size) for t in f.terms])[:-1]))))
         went.append(abs(there[i] - here[i]) / sizes[i])
-    share = tolerance.shares([f, *moved], told) / TIED  # of what may be, [P]
-    return np.array(went) / np.maximum(share, 1e-12)
+    return np.array(went) / np.maximum(tolerance.shares([f, *moved], told), 1e-12)
 
 
 def _covariance(f: Fit) -> Array:

@@ -22,9 +22,10 @@ from mpc_sgft.diagnose.verdict.relevance import (
     shares_of,
     what_matters,
 )
-from mpc_sgft.diagnose.verdict.tolerance import TIED, Tolerance
+from mpc_sgft.diagnose.verdict.tolerance import Tolerance
 from mpc_sgft.diagnose.verdict.uncertainty import Interval, tolerant_intervals
 
+TIED = 0.5  # of what the user tolerates: sets that foretell the same but for less tie, whatever the data say of them
 LEFT = 0.1  # share of the squared error above noise that names may leave
 
 

@@ -11,7 +11,6 @@ from mpc_sgft.diagnose.data.measured import Array
 from mpc_sgft.diagnose.fitting.fit import fit
 from mpc_sgft.diagnose.fitting.hypothesis import Hypothesis, judge_fit
 from mpc_sgft.diagnose.fitting.prepare import Setup
-from mpc_sgft.diagnose.verdict.tolerance import TIED
 from mpc_sgft.diagnose.verdict.uncertainty import indistinct, intervals, tolerant_intervals
 from tests.mpc_sgft.diagnose.lines import Lines, motion, term
 
@@ -30,11 +29,11 @@ def fitted_lines(names: str, problem: Lines) -> Hypothesis:
     return judge_fit(setup, fit(problem, [term(n) for n in names], [np.ones(1)] * len(names), fitted))
 
 
-def test_a_parameter_goes_as_far_as_half_of_the_tolerance_lets_it() -> None:
+def test_a_parameter_goes_as_far_as_the_tolerance_lets_it() -> None:
     problem = Lines()
     one = fitted_lines("a", problem)
     tolerance = motion(problem, 0.02, asked=True)
-    by_hand = TIED * float(tolerance.limits[0]) / rms(problem.columns["a"])
+    by_hand = float(tolerance.limits[0]) / rms(problem.columns["a"])
     assert indistinct(one.fit, tolerance, EVEN) == pytest.approx(by_hand, rel=1e-6)
     (low,), (high,) = tolerant_intervals(one, tolerance, EVEN)[0]
     (least,), (most,) = intervals(one)[0]
@@ -49,8 +48,8 @@ def test_parameters_that_make_up_for_each_other_go_further() -> None:
     both, tolerance = fitted_lines("ab", problem), motion(problem, 0.02, asked=True)
     least = min(rms(c["a"] * x - c["b"]) for x in np.linspace(0.5, 1.5, 2001))  # for a change of b by one
     reach = indistinct(both.fit, tolerance, EVEN)
-    assert reach[1] == pytest.approx(TIED * float(tolerance.limits[0]) / least, rel=0.1)
-    assert reach[1] > 3 * TIED * float(tolerance.limits[0]) / rms(c["b"])
+    assert reach[1] == pytest.approx(float(tolerance.limits[0]) / least, rel=0.1)
+    assert reach[1] > 3 * float(tolerance.limits[0]) / rms(c["b"])
 
 
 def test_what_nobody_tolerates_widens_nothing() -> None:

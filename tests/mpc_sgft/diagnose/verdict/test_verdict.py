@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from mpc_sgft.diagnose.candidates.effect_table import INCLUDES
+from mpc_sgft.diagnose.candidates.library import Term
 from mpc_sgft.diagnose.fitting.fit import fit
 from mpc_sgft.diagnose.fitting.hypothesis import Hypothesis, judge_fit
 from mpc_sgft.diagnose.fitting.prepare import Setup
 from mpc_sgft.diagnose.fitting.residual_model import ResidualModel
 from mpc_sgft.diagnose.verdict.naming import find_ties, gains
-from mpc_sgft.diagnose.verdict.relevance import certain
+from mpc_sgft.diagnose.verdict.relevance import certain, what_matters
 from mpc_sgft.diagnose.verdict.uncertainty import intervals
 from mpc_sgft.diagnose.verdict.verdict import reach_verdict
-from tests.mpc_sgft.diagnose.lines import Lines, motion, term
+from tests.mpc_sgft.diagnose.lines import Lines, Points, motion, term
 
 
 def test_a_gain_is_worth_a_name_from_a_twentieth_of_the_error_on() -> None:
@@ -174,3 +177,35 @@ def test_an_effect_must_matter_for_certain() -> None:
         low / value
     )
     assert certain(both._replace(fit=both.fit._replace(values=(both.values[0], 0.01 * both.values[1]))), 1) < 1e-6
+
+
+class TwoParts(Lines):
+    """The effect "rich" does `a` as its first parameter says, and `b` as its second."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.columns["rich"] = self.columns["a"]
+
+    def residuals(self, terms: Sequence[Term], points: Points, pick: np.ndarray) -> np.ndarray:
+        more = [sum(v[1] * self.columns["b"] for v in values if len(v) > 1) for values in points]
+        return super().residuals(terms, points, pick) + np.stack([np.broadcast_to(x, self.y.shape)[pick] for x in more])
+
+
+def test_a_simpler_effect_is_tried_where_traces_hid_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It was fitted beside a trace only; once that is gone, the richer one must still make way."""
+    monkeypatch.setitem(INCLUDES, "rich", {"a": {"p": "a"}})
+    problem, fitted, none, rng = TwoParts(), np.arange(18), np.zeros(1), np.random.default_rng(5)
+    c, two = problem.columns, np.ones(2)
+    problem.y = 10 * c["a"] + 0.3 * c["b"] + 0.3 * c["h"] + rng.normal(size=problem.y.shape)
+    rich = replace(
+        term("rich"), names=("p", "q"), units=("1", "1"), neutral=0 * two, low=-50 * two, high=50 * two, size=two
+    )
+    setup = Setup(problem, fitted, np.arange(18, 24), fitted // 3, fit(problem, [], [], fitted), none, none, np.log1p)
+    base = judge_fit(setup, setup.baseline)
+    sets = [
+        judge_fit(setup, fit(problem, [t, term("h")], [0.5 * np.ones(len(t.size)), np.ones(1)], fitted))
+        for t in (rich, term("a"))
+    ]
+    best, traces = what_matters(setup, sets[0], [base, *sets], rng, motion(problem, 0.2))
+    assert (best.names, [t.term.effect for t in traces]) == (["a"], ["h"])
+    assert best.values[0] == pytest.approx(10, abs=0.1)
