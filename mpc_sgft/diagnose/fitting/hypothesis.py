@@ -91,7 +91,8 @@ def holds(rich: Hypothesis, simple: Hypothesis) -> bool:
 def without_effect(setup: Setup[Any], e: Hypothesis, i: int, hypotheses: list[Hypothesis]) -> Hypothesis:
     """A set without its i-th effect, as it was fitted, or fitted now from where the others are."""
     drop = len(e.fit.terms) - e.effects + i
-    terms, values = ([*x[:drop], *x[drop + 1 :]] for x in (e.fit.terms, e.fit.values))
+    terms = [*e.fit.terms[:drop], *e.fit.terms[drop + 1 :]]
+    values = [*e.fit.values[:drop], *e.fit.values[drop + 1 :]]
     return _fitted(setup, terms, values, e.effects - 1, hypotheses)
 
 
