@@ -25,7 +25,7 @@ from tools.studies.foreign.draw import Case, redraw
 from tools.studies.foreign.loop import Engine, Record, Sensor, Unable, simulate
 from tools.studies.foreign.scenes import SCENES, Scene, build, parameters
 
-ATTEMPTS = 8  # to draw a case whose effects matter
+ATTEMPTS = 40  # to draw a case whose effects matter
 EQUAL = 0.1  # detectable sizes: names that leave no more of a trace than this are one name to these equations
 FELT = 0.01  # noise of a measured force, of the typical force
 SWING = (0.4, 1.3)  # [rad] from which machines are let go
