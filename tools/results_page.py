@@ -61,6 +61,8 @@ def tasks() -> str:
     walked = {"gap": "gap", "method": "method", "seed": "seed", "rollouts": "rollouts"}
     walked |= {"return": ("return", digits), "success": ("success", percent)}
     parts.append(f"Return, of at most 200:\n\n{pick(read('tasks/walker_walk.csv'), walked)}")
+    bound = {name: name for name in ("checkpoint", "transitions", "episodes")} | {"return": ("return", digits)}
+    parts.append(f"What training in `walker_real` itself comes to:\n\n{pick(read('tasks/walker_bound.csv'), bound)}")
     named = pick(read("tasks/diagnose_run.csv"), {**NAMED, "verdict": "verdict"})
     parts.append(f"What `diagnose --run` names in these realities:\n\n{named}")
     return "\n\n".join(parts)
