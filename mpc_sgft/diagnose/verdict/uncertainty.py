@@ -11,15 +11,20 @@ from the parameters without prior knowledge of it, Brynjarsdottir and O'Hagan 20
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from scipy import stats
 
 from mpc_sgft.diagnose.data.measured import Array
 from mpc_sgft.diagnose.fitting.fit import Fit
 from mpc_sgft.diagnose.fitting.hypothesis import Hypothesis
+from mpc_sgft.diagnose.fitting.prepare import Setup
 from mpc_sgft.diagnose.verdict.tolerance import Tolerance
 
 WIDER = 1.3  # of intervals: what windows that begin at each other's ends share; set on development seeds
+LADDER = 0.5 * 2 ** (0.5 * np.arange(27))  # standard deviations by derivatives that a comparison goes away: to 4096
+RUNGS = 9  # of these that are looked at together
 STEP = 0.02  # in typical sizes, of the parameter that moves most, to see how predictions move
 Interval = tuple[Array, Array]  # low and high of each parameter of one effect
 
@@ -41,23 +46,68 @@ def standard_deviations(e: Hypothesis) -> list[Array]:
 
 def intervals(e: Hypothesis, level: float = 0.90) -> list[Interval]:
     """Low and high of each effect's parameters, as the data's scatter has them."""
-    return _around(e, [_half(e, level) * sd for sd in standard_deviations(e)])
+    half = float(stats.t.ppf(0.5 + level / 2, max(len(e.fit.r) - 1, 1)))
+    rows = zip(e.fit.terms, e.fit.values, standard_deviations(e), strict=True) if e.fit.terms else ()
+    bounds = [(np.maximum(v - half * sd, t.low), np.minimum(v + half * sd, t.high)) for t, v, sd in rows]
+    return bounds[len(bounds) - e.effects :]
 
 
-def tolerant_intervals(e: Hypothesis, tolerance: Tolerance, told: Array, level: float = 0.90) -> list[Interval]:
-    """`intervals`, and with them what differs by no more than the user tolerates, as squares add up.
+def compared(setup: Setup[Any], e: Hypothesis, level: float = 0.90) -> list[Interval]:
+    """The parameters that data cannot tell from the best, by comparing errors window by window as sets are compared.
+
+    Where contacts begin and end within windows, derivatives are noise, and so is what `intervals` makes of them. Here
+    each parameter goes away from its best value by ever more, the others along as far as derivatives say, until the
+    errors have credibly risen, by a paired t-test at this level.
+    """
+    if not e.effects:
+        return []
+    f, everything = e.fit, np.concatenate([setup.fitted, setup.held])
+    inverse = _covariance(f)
+    sizes = np.concatenate([t.size for t in f.terms])
+    low, high = (np.concatenate([getattr(t, end) for t in f.terms]) for end in ("low", "high"))
+    here, ends = np.concatenate(f.values), np.cumsum([len(t.size) for t in f.terms])[:-1]
+
+    def errors(points: list[Array]) -> Array:
+        r = setup.problem.residuals(f.terms, [np.split(x, ends) for x in points], everything)
+        return setup.judged((r**2).mean(-1))
+
+    best = errors([here])[0]
+    enough = WIDER * float(stats.t.ppf(0.5 + level / 2, len(best) - 1)) / np.sqrt(len(best))
+
+    def worse_from(i: int, way: Array) -> float:
+        """Where the i-th parameter is when errors have risen."""
+        for some in LADDER.reshape(-1, RUNGS):
+            tries = [np.clip(here + k * way, low, high) for k in some]
+            rise = errors(tries) - best  # [K, W]
+            risen = np.flatnonzero(rise.mean(-1) > enough * rise.std(-1, ddof=1))
+            if len(risen):
+                return float(tries[risen[0]][i])
+        return float((low, high)[int(way[i] > 0)][i])
+
+    sd = np.concatenate(standard_deviations(e))
+    ways = inverse / np.diag(inverse) * sizes[:, None] / sizes * sd  # column i: of all, for one sd of the i-th
+    reach = np.array([[worse_from(i, sign * way) for i, way in enumerate(ways.T)] for sign in (-1, 1)])
+    return [*zip(*(np.split(r, ends)[len(f.terms) - e.effects :] for r in reach), strict=True)]
+
+
+def sure_intervals(setup: Setup[Any], e: Hypothesis, tolerance: Tolerance, told: Array) -> list[Interval]:
+    """The 90 % intervals that a report shows: statistical, and as squares add up, what the user tolerates.
 
     Args:
+        setup: Problem; where its residuals are rugged, the statistical part is `compared`, else `intervals`.
         e: The set.
-        tolerance: Prediction errors that do not matter; if the user gave none, the intervals are `intervals`.
+        tolerance: Prediction errors that do not matter.
         told: Weights of windows, [W].
-        level: Of the statistical part.
     """
+    statistical = compared(setup, e) if setup.problem.pattern else intervals(e)
     if not (tolerance.asked and e.effects):
-        return intervals(e, level)
-    reach = _by_term(e.fit, indistinct(e.fit, tolerance, told))
-    statistical = (_half(e, level) * sd for sd in standard_deviations(e))
-    return _around(e, [np.hypot(s, r) for s, r in zip(statistical, reach, strict=True)])
+        return statistical
+    reach = _by_term(e.fit, indistinct(e.fit, tolerance, told))[len(e.fit.terms) - e.effects :]
+    rows = zip(e.terms, e.values, statistical, reach, strict=True)
+    return [
+        (np.maximum(v - np.hypot(v - low, r), t.low), np.minimum(v + np.hypot(high - v, r), t.high))
+        for t, v, (low, high), r in rows
+    ]
 
 
 def indistinct(f: Fit, tolerance: Tolerance, told: Array) -> Array:
@@ -85,19 +135,7 @@ def _covariance(f: Fit) -> Array:
     return np.linalg.pinv(A + 1e-12 * np.eye(len(A)) * max(float(np.trace(A)), 1e-30))
 
 
-def _half(e: Hypothesis, level: float) -> float:
-    """Half the width of an interval in standard deviations."""
-    return float(stats.t.ppf(0.5 + level / 2, max(len(e.fit.r) - 1, 1)))
-
-
 def _by_term(f: Fit, x: Array) -> list[Array]:
     """Numbers of all parameters in typical sizes -> in their own units, term by term."""
     ends = np.cumsum([len(t.size) for t in f.terms])
     return [part * t.size for part, t in zip(np.split(x, ends[:-1]), f.terms, strict=True)]
-
-
-def _around(e: Hypothesis, half: list[Array]) -> list[Interval]:
-    """Intervals of the effects, of so much to each side, within what their parameters can be."""
-    rows = zip(e.fit.terms, e.fit.values, half, strict=True) if e.fit.terms else ()
-    bounds = [(np.maximum(v - h, t.low), np.minimum(v + h, t.high)) for t, v, h in rows]
-    return bounds[len(e.fit.terms) - e.effects :]

@@ -23,7 +23,7 @@ from mpc_sgft.diagnose.verdict.relevance import (
     what_matters,
 )
 from mpc_sgft.diagnose.verdict.tolerance import Tolerance
-from mpc_sgft.diagnose.verdict.uncertainty import Interval, tolerant_intervals
+from mpc_sgft.diagnose.verdict.uncertainty import Interval, sure_intervals
 
 TIED = 0.5  # of what the user tolerates: sets that foretell the same but for less tie, whatever the data say of them
 LEFT = 0.1  # share of the squared error above noise that names may leave
@@ -103,7 +103,7 @@ def reach_verdict(
         if open_ties:
             reason = f"{_list(best)} and {len(open_ties)} others tie"
     shares = shares_of(setup, best, there, hypotheses, rng)
-    sure = tolerant_intervals(best, tolerance, told)
+    sure = sure_intervals(setup, best, tolerance, told)
     return Verdict(kind, best, named, probability, reason, there, shares, traces, sure)
 
 
