@@ -37,7 +37,8 @@ def pretrain() -> str:
     return "\n\n".join([*parts, "A wide model:", pick(read("pretrain/precision.csv"), rounded | {"return": "return"})])
 
 
-NAMED = {"gap": "gap", "seed": "seed", "effect": "effect", "parameter": "parameter", "value": ("value", digits)}
+NAMED = {"gap": "gap", "seed": "seed", "effect": "effect", "parameter": "parameter"}
+NAMED |= {name: (name, digits) for name in ("value", "low", "high")}
 
 
 def transfer() -> str:
@@ -177,7 +178,10 @@ def loop() -> str:
     head |= {"30 rollouts": ("final_before", percent), "after ": ("final_after", percent)}
     head |= {"rollouts to 95 %": "rollouts_to_95_before", "after  ": "rollouts_to_95_after"}
     parts = [pick(read("close_the_loop/close_the_loop.csv"), head)]
-    for file, says in (("diagnose_run", "What was named"), ("diagnose_run_again", "With the later solver")):
+    for file, says in (
+        ("diagnose_run", "What was named"),
+        ("diagnose_run_again", "Of others, with the present solver"),
+    ):
         parts.append(f"{says}:\n\n{pick(read(f'close_the_loop/{file}.csv'), NAMED)}")
     return "\n\n".join(parts)
 
@@ -249,10 +253,14 @@ def growth() -> str:
 
 
 def quality() -> str:
-    rows = [{**r, "variant": r["variant"] or "as configured"} for r in read("plan_quality/plan_quality.csv")]
     head: dict[str, str | tuple[str, Callable[[str], str]]] = {"gap": "gap", "search": "variant"}
     head |= {"success": ("success", tenth), "low": ("success_low", tenth), "high": ("success_high", tenth)}
-    return pick(rows, {**head, "regret": "regret", "spread": "spread", "ms": "plan_ms"})
+    head |= {"regret": "regret", "spread": "spread", "ms": "plan_ms"}
+    parts = []
+    for file in ("plan_quality", "decay"):
+        rows = [{**r, "variant": r["variant"] or "as configured"} for r in read(f"plan_quality/{file}.csv")]
+        parts.append(pick(rows, head))
+    return "\n\n".join(parts)
 
 
 def updates_per_s() -> float:
