@@ -137,7 +137,15 @@ def blind() -> str:
 
 
 def foreign() -> str:
-    rows = read("foreign/foreign.csv")
+    parts = []
+    for file in ("foreign", "earlier"):
+        rows = read(f"foreign/{file}.csv")
+        parts.append(f"Seed {rows[0]['seed']}:\n\n{by_ground(rows)}")
+    return "\n\n".join(parts)
+
+
+def by_ground(rows: list[Row]) -> str:
+    """Scores by ground."""
     grounds = list(dict.fromkeys(r["ground"] for r in rows))
     by = {(r["ground"], r["score"]): r for r in rows}
     lines = []
