@@ -35,7 +35,7 @@ class Threshold(NamedTuple):
     idle: float
 
 
-JUDGE, NAMING = ("fitting.judge",), ("verdict.naming",)
+JUDGE = ("fitting.judge",)
 THRESHOLDS = (
     Threshold("MIN_SHARE", JUDGE, 0.0),
     Threshold("TIE_ODDS", JUDGE, 1.0),
@@ -43,7 +43,7 @@ THRESHOLDS = (
     Threshold("FEW", JUDGE, 0.0),
     Threshold("ELSEWHERE", JUDGE, -float("inf")),
     Threshold("NEAR", JUDGE, 0.0),
-    Threshold("WIDER", NAMING, 1.0),
+    Threshold("WIDER", ("verdict.uncertainty",), 1.0),
     Threshold("LEFT", ("verdict.verdict",), 1.0),
     Threshold("MATTERS", ("verdict.verdict", "verdict.relevance"), 0.0),
     Threshold("SMALL", ("verdict.tolerance",), 0.0),
