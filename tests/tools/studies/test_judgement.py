@@ -21,11 +21,13 @@ def test_a_threshold_is_idle_for_a_while(threshold: Threshold) -> None:
 
 
 def test_thresholds_are_idle_together() -> None:
-    judge, naming = (importlib.import_module(f"mpc_sgft.diagnose.{m}") for m in ("fitting.judge", "verdict.naming"))
-    before = judge.MIN_SHARE, judge.TIE_ODDS, naming.WIDER
+    judge, uncertainty = (
+        importlib.import_module(f"mpc_sgft.diagnose.{m}") for m in ("fitting.judge", "verdict.uncertainty")
+    )
+    before = judge.MIN_SHARE, judge.TIE_ODDS, uncertainty.WIDER
     with idle("MIN_SHARE+WIDER"):
-        assert (judge.MIN_SHARE, judge.TIE_ODDS, naming.WIDER) == (0.0, before[1], 1.0)
-    assert (judge.MIN_SHARE, judge.TIE_ODDS, naming.WIDER) == before
+        assert (judge.MIN_SHARE, judge.TIE_ODDS, uncertainty.WIDER) == (0.0, before[1], 1.0)
+    assert (judge.MIN_SHARE, judge.TIE_ODDS, uncertainty.WIDER) == before
 
 
 def test_a_threshold_that_is_none_is_named(capsys: pytest.CaptureFixture[str]) -> None:
