@@ -4,7 +4,9 @@
     python -m tools.studies.close_the_loop small.csv --gaps dev_turned --seeds 0 --transitions 5000 --set rollouts=4
 
 Each gap and seed has a folder under --runs; a first deployment or a comparison that is there is not made again. The gap
-is known to the two deployments alone.
+is known to the two deployments alone. `--curves` writes what came of it as `tools.studies.benchmark --with` takes it
+in: success before, and what the agent that was trained again reaches before it learns from anything real itself. With
+`--effects` only those are looked for, as where one thinks beforehand of what may differ.
 """
 
 import argparse
@@ -13,6 +15,7 @@ from pathlib import Path
 
 from mpc_sgft.diagnose.__main__ import main as diagnose
 from tools.studies.runner import finished, write
+from tools.studies.study import COLUMNS as CURVE
 
 COLUMNS = [
     "gap",
@@ -37,21 +40,35 @@ def main() -> None:
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
     parser.add_argument("--transitions", type=int, default=60_000)
     parser.add_argument("--set", nargs="*", default=[], metavar="name=value", help="overrides of the deployments")
+    parser.add_argument("--effects", metavar="A,B", help="look for these alone")
+    parser.add_argument("--curves", type=Path, metavar="CSV", help="success before and after, as a method `identify`")
     parser.add_argument("--runs", type=Path, default=Path("runs/close_the_loop"))
     args = parser.parse_args()
-    rows = []
+    how = ["--retrain", "--retrain-transitions", str(args.transitions)]
+    how += ["--effects", args.effects] if args.effects else []
+    rows, curves = [], []
     for gap in args.gaps:
         for seed in args.seeds:
-            rows.append(one(gap, seed, args.runs / f"{gap}-{seed}", args.transitions, args.set))
+            run = args.runs / f"{gap}-{seed}"
+            rows.append(one(gap, seed, run, args.set, how))
             write(args.csv, COLUMNS, rows)
+            if args.curves:
+                curves += curve(rows[-1], run, args.effects)
+                write(args.curves, CURVE, curves)
 
 
-def one(gap: str, seed: int, run: Path, transitions: int, overrides: list[str]) -> dict[str, object]:
-    """One row; raises RunFailed or SystemExit if a command fails."""
+def one(gap: str, seed: int, run: Path, overrides: list[str], how: list[str]) -> dict[str, object]:
+    """One row; raises RunFailed or SystemExit if a command fails.
+
+    Args:
+        gap, seed, overrides: Of the deployments.
+        run: Folder of the first.
+        how: Options of `diagnose --run`.
+    """
     finished("deploy", run, [f"gap={gap}", f"seed={seed}", "log.rerun=false", *overrides])
     found = run / "diagnosis"
-    if not (found / "retrain.json").exists():
-        check(diagnose(["--run", str(run), "--retrain", "--retrain-transitions", str(transitions)]))
+    if not ((found / "retrain.json").exists() or named_nothing(found / "report.json")):
+        check(diagnose(["--run", str(run), *how]))
     report = json.loads((found / "report.json").read_text())
     row: dict[str, object] = {
         "gap": gap,
@@ -68,6 +85,27 @@ def one(gap: str, seed: int, run: Path, transitions: int, overrides: list[str]) 
             row[f"final_{when}"] = result[when]["final_success"]
             row[f"rollouts_to_95_{when}"] = result[when]["rollouts_to_95"]
     return row
+
+
+def named_nothing(report: Path) -> bool:
+    """Whether a report is there, and holds no effect to train again with."""
+    return report.exists() and not json.loads(report.read_text())["effects"]
+
+
+def curve(row: dict[str, object], run: Path, effects: str | None) -> list[dict[str, object]]:
+    """The rows of a learning curve: before, and after the real rollouts that were diagnosed.
+
+    Where nothing was named nothing is trained again, and the agent stays as it was.
+    """
+    summary = json.loads((run / "summary.json").read_text())
+    again = run / "diagnosis" / "deploy" / "summary.json"
+    after = json.loads(again.read_text()) if "zero_shot_after" in row else summary
+    known = {"gap": row["gap"], "method": "identify", "variant": f"effects={effects}" if effects else ""}
+    known |= {"seed": row["seed"], "episodes": summary["evaluation_episodes"]}
+    return [
+        known | {"rollouts": rollouts, "success": s["curve"]["0"], "return": s["return_curve"]["0"]}
+        for rollouts, s in ((0, summary), (summary["real_rollouts"], after))
+    ]
 
 
 def words(effect: dict) -> str:

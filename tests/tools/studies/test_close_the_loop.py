@@ -1,0 +1,41 @@
+"""Deployments that were diagnosed and made again become rows of the study and curves of the benchmark."""
+
+import csv
+import json
+from pathlib import Path
+
+import pytest
+
+from tools.studies import close_the_loop
+from tools.studies.runner import read_curves
+
+
+def deployment(folder: Path, zero_shot: float) -> None:
+    folder.mkdir(parents=True)
+    curves = {"curve": {"0": zero_shot, "10": zero_shot}, "return_curve": {"0": -1.0, "10": -1.0}}
+    summary = {"real_rollouts": 10, "evaluation_episodes": 100, **curves}
+    (folder / "summary.json").write_text(json.dumps(summary))
+
+
+def test_what_was_measured_is_written_and_nothing_runs_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    angle = {"name": "frame_rotation", "at": ["base"], "parameters": {"angle": {"value": 0.6}}}
+    for seed, effects in ((0, [angle]), (1, [])):
+        run = tmp_path / "runs" / f"turned-{seed}"
+        deployment(run, 0.1)
+        (run / "diagnosis").mkdir()
+        report = {"verdict": "effect" if effects else "none", "effects": effects, "seconds": 80.0}
+        (run / "diagnosis" / "report.json").write_text(json.dumps(report))
+        if effects:
+            deployment(run / "diagnosis" / "deploy", 0.9)
+            outcome = {"zero_shot_success": 0.9, "final_success": 0.95, "rollouts_to_95": 10}
+            both = {"transitions": 60000, "before": outcome | {"zero_shot_success": 0.1}, "after": outcome}
+            (run / "diagnosis" / "retrain.json").write_text(json.dumps(both))
+    words = ["loop", str(tmp_path / "loop.csv"), "--gaps", "turned", "--seeds", "0", "1", "--runs", f"{tmp_path}/runs"]
+    monkeypatch.setattr("sys.argv", [*words, "--curves", str(tmp_path / "curves.csv")])
+    close_the_loop.main()
+    first, second = csv.DictReader((tmp_path / "loop.csv").open())
+    assert (first["found"], first["zero_shot_after"]) == ("frame_rotation@base angle=0.6", "0.9")
+    assert (second["verdict"], second["found"], second["zero_shot_after"]) == ("none", "", "")
+    seeds = read_curves([tmp_path / "curves.csv"])["turned"]["identify"]
+    successes = {seed: [curve[n]["success"] for n in (0, 10)] for seed, curve in seeds.items()}
+    assert successes == {0: ["0.1", "0.9"], 1: ["0.1", "0.1"]}  # who names nothing trains nothing again
