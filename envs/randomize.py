@@ -40,10 +40,11 @@ class Draw:
         if self.low > self.high or (self.distribution == "loguniform" and self.low <= 0):
             raise ValueError(f"range {self.low} to {self.high} is empty or not positive ({self.distribution})")
 
-    def sample(self, rng: np.random.Generator) -> float:
+    def value(self, place: float) -> float:
+        """The number at a place in the range, 0 at `low` and 1 at `high`."""
         if self.distribution == "loguniform":
-            return float(np.exp(rng.uniform(np.log(self.low), np.log(self.high))))
-        return float(rng.uniform(self.low, self.high))
+            return float(np.exp(np.log(self.low) + (np.log(self.high) - np.log(self.low)) * place))
+        return self.low + (self.high - self.low) * place
 
 
 def load(draws: Mapping[str, Mapping[str, Any]]) -> list[Draw]:
@@ -69,12 +70,18 @@ def load(draws: Mapping[str, Mapping[str, Any]]) -> list[Draw]:
 class Randomizer:
     """Writes the draws into the per-simulation fields of a batch.
 
+    Attributes:
+        places: Where in its range each simulation's last draws lie, 0 to 1, [N, D].
+        shapes: Beta distributions to draw these places from, (a, b) each draw, [D, 2]; None: uniform.
+
     Raises:
         ValueError: For a field or a name that the model lacks, or a delay that its command history cannot hold.
     """
 
-    def __init__(self, batch: Batch, model: mujoco.MjModel, draws: list[Draw]):
+    def __init__(self, batch: Batch, model: mujoco.MjModel, draws: list[Draw], sims: int):
         self.batch, self.draws = batch, draws
+        self.places = np.full((sims, len(draws)), np.nan)
+        self.shapes: NDArray | None = None
         self.targets = [[_locate(model, field, d.at) for field in d.fields] for d in draws]
         names = {name for targets in self.targets for name, _, _ in targets}
         self.arrays = {name: batch.expand(name) for name in names}
@@ -86,7 +93,9 @@ class Randomizer:
     def draw(self, sims: list[int], rngs: list[np.random.Generator]) -> None:
         """Give each simulation in `sims` a model of its own, drawn with its own generator."""
         for sim, rng in zip(sims, rngs, strict=True):
-            self._write({name: array[sim] for name, array in self.arrays.items()}, [d.sample(rng) for d in self.draws])
+            self.places[sim] = rng.random(len(self.draws)) if self.shapes is None else rng.beta(*self.shapes.T)
+            values = [d.value(float(x)) for d, x in zip(self.draws, self.places[sim], strict=True)]
+            self._write({name: array[sim] for name, array in self.arrays.items()}, values)
         if self.needs_constants and sims:
             self.batch.set_const(np.array(sims, np.int32))
 

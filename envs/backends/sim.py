@@ -77,7 +77,7 @@ class SimBackend:
         self.applied = self.batch.bind("qfrc_applied")[:, : nominal.nv]
         self.told = np.zeros((num_envs, nominal.nu))  # control signals before the effects that change them
         self.hides_commands = any(type(e).command is not Effect.command for e in self.effects)
-        self.randomizer = Randomizer(self.batch, self.model, draws or [])
+        self.randomizer = Randomizer(self.batch, self.model, draws or [], num_envs)
         self.noise_sd, self.noise_probability, self.believes = noise_sd, noise_probability, reward == "observed"
         self.steps = whole_steps(task.control_dt, task.sim_dt)
         self.has_force = any(type(e).force is not Effect.force for e in self.effects)

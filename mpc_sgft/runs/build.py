@@ -4,11 +4,13 @@ import copy
 import logging
 from contextlib import closing
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
+from scipy.stats import beta
+from torch import Tensor
 
 import mpc_sgft
 from envs import effects, randomize
@@ -20,6 +22,9 @@ from mpc_sgft.learning.observation_map import Sensed
 from mpc_sgft.learning.world_model import WorldModel
 from mpc_sgft.storage import checkpoint
 from planners.malloc import keep_freed_memory
+
+if TYPE_CHECKING:
+    from mpc_sgft.learning.doraemon import Doraemon  # only where it is asked for: its solver takes time to import
 
 STARTS = 64  # simulated episodes whose starts tell where real ones should
 
@@ -66,13 +71,45 @@ def make_env(
     with from_config("randomize"):
         draws = []
         if randomised:
-            draws = randomize.load(OmegaConf.to_container(cfg.randomize.draws, resolve=True))  # type: ignore[arg-type]
+            draws = list(draws_of(cfg).values())
             noise = {"noise_sd": cfg.randomize.noise_sd, "noise_probability": cfg.randomize.noise_probability}
     reward = {"reward": cfg.backend.reward} if "reward" in cfg.get("backend", {}) else {}
     with from_config("simulation"):
         how = {"threads": threads, "physics": cfg.physics, **noise, **reward}
         backend = SimBackend(task, num_envs, effects=present, draws=draws, **how)
     return ControlEnv(backend, history=cfg.task.history)
+
+
+def draws_of(cfg: DictConfig) -> dict[str, randomize.Draw]:
+    """The draws of `cfg.randomize` by their names.
+
+    Raises:
+        ValueError: For one that is not allowed.
+    """
+    entries = OmegaConf.to_container(cfg.randomize.draws, resolve=True)
+    draws = randomize.load(entries)  # type: ignore[arg-type]
+    return dict(zip(entries, draws, strict=True))  # type: ignore[arg-type]
+
+
+def make_curriculum(cfg: DictConfig) -> "Doraemon | None":
+    """What widens the ranges of `cfg.randomize` while pretraining goes on; None if nothing does.
+
+    Raises:
+        UserError: For a number that it refuses, or without anything that is randomised.
+    """
+    if cfg.curriculum.get("_target_") is None:
+        return None
+    with from_config("curriculum"):
+        return instantiate(cfg.curriculum, draws=len(cfg.randomize.draws))
+
+
+def drawn_ranges(cfg: DictConfig, shapes: Tensor) -> dict[str, list[float]]:
+    """Of each draw, where 90 % of what the Beta distributions [D, 2] draw lies, {name: [from, to]}, its own unit."""
+    ends = beta.ppf([[0.05], [0.95]], *shapes.T.numpy()).T  # [D, 2]
+    return {
+        name: [round(draw.value(float(x)), 4) for x in places]
+        for (name, draw), places in zip(draws_of(cfg).items(), ends, strict=True)
+    }
 
 
 def sensed(cfg: DictConfig) -> Sensed:

@@ -71,11 +71,15 @@ def shown(act: Act, bar: tqdm) -> Act:
 def score(episodes: TensorDict) -> Score:
     """Success at the end of each environment's first episode, with its interval, and the mean return."""
     first = episodes["episode"] == episodes["episode"][:, :1]
-    last = first.long().cumsum(1).argmax(1)  # [N] index of the first episode's last step
-    rows = torch.arange(len(last))
-    success = episodes["next", "success"][rows, last, 0]
     returns = (episodes["next", "reward"][..., 0] * first).sum(1)
-    return score_of(success.tolist(), returns.tolist())
+    return score_of(succeeded(episodes).tolist(), returns.tolist())
+
+
+def succeeded(episodes: TensorDict) -> Tensor:
+    """Success at the end of each environment's first episode, of steps [N, T]: bool [N]."""
+    first = episodes["episode"] == episodes["episode"][:, :1]
+    last = first.long().cumsum(1).argmax(1)  # [N] index of the first episode's last step
+    return episodes["next", "success"][torch.arange(len(last)), last, 0]
 
 
 def score_of(successes: Sequence[bool], returns: Sequence[float]) -> Score:

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from contextlib import closing
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from omegaconf import DictConfig
 from tensordict import TensorDict
@@ -23,6 +24,7 @@ class Round(NamedTuple):
 
     number: int
     weights: dict[str, Tensor] | None  # of the parts in POLICY; None: uniform random actions
+    shapes: tuple[tuple[float, float], ...] | None = None  # Beta distributions of the draws; None: uniform
 
 
 class Collected(NamedTuple):
@@ -30,16 +32,19 @@ class Collected(NamedTuple):
 
     steps: TensorDict  # [N, T], episodes numbered from 0
     unstable: int  # episodes that the simulator had to give up
+    places: Tensor  # where in its range each draw lay, [N, D]; nan where the episode says nothing about the policy
+    shapes: tuple[tuple[float, float], ...] | None  # what these places were drawn from
 
     def state_dict(self) -> dict[str, Any]:
         """As nested dicts of tensors and numbers, for `Collected.of`."""
-        flat = self.steps.flatten_keys(".")
-        return {"steps": {str(k): v for k, v in flat.items()}, "size": tuple(flat.shape), "unstable": self.unstable}
+        flat, state = self.steps.flatten_keys("."), self._asdict()
+        return state | {"steps": {str(k): v for k, v in flat.items()}, "size": tuple(flat.shape)}
 
     @classmethod
     def of(cls, state: Mapping[str, Any]) -> "Collected":
         """What `state_dict` wrote down."""
-        return cls(TensorDict(state["steps"], state["size"]).unflatten_keys("."), state["unstable"])
+        steps = TensorDict(state["steps"], state["size"]).unflatten_keys(".")
+        return cls(steps, state["unstable"], state["places"], state["shapes"])
 
 
 def policy_weights(model: WorldModel) -> dict[str, Tensor]:
@@ -68,13 +73,19 @@ class Explorer:
         """Collect this worker's share of a round."""
         before = self.env.backend.counters["unstable"]
         seed = round_seed(self.cfg.seed, order.number * self.parts + self.part)
+        randomizer = self.env.backend.randomizer
+        randomizer.shapes = None if order.shapes is None else np.array(order.shapes)
         if order.weights is None:
             act = random_policy(self.env, seed)
         else:
             self.model.load_state_dict(order.weights, strict=False)
             act = explorer(self.model, self.cfg, self.env.batch_size[0], seed)
         steps = collect(self.env, act, seed=seed)
-        return Collected(steps, self.env.backend.counters["unstable"] - before)
+        places = torch.from_numpy(randomizer.places.copy())
+        roaming = len(places) if order.weights is None else int(self.cfg.detours.share * len(places))
+        places[:roaming] = torch.nan
+        places[steps["episode"][:, 0] != steps["episode"][:, -1]] = torch.nan  # drawn anew since
+        return Collected(steps, self.env.backend.counters["unstable"] - before, places, order.shapes)
 
 
 def explored(cfg: DictConfig, model: WorldModel, episodes: int) -> TensorDict:
@@ -105,10 +116,11 @@ def share(count: int, part: int, parts: int) -> int:
 def joined(collected: list[Collected]) -> Collected:
     """The shares of a round together, their episodes numbered one after the other."""
     following = 0
-    for steps, _ in collected:
-        steps["episode"] += following
-        following = int(steps["episode"].max()) + 1
-    return Collected(torch.cat([c.steps for c in collected]), sum(c.unstable for c in collected))
+    for found in collected:
+        found.steps["episode"] += following
+        following = int(found.steps["episode"].max()) + 1
+    steps, places = torch.cat([c.steps for c in collected]), torch.cat([c.places for c in collected])
+    return Collected(steps, sum(c.unstable for c in collected), places, collected[0].shapes)
 
 
 def explorer(model: WorldModel, cfg: DictConfig, num_envs: int, seed: int) -> Act:

@@ -18,7 +18,7 @@ from envs.env import ControlEnv
 from mpc_sgft.command.errors import Stopped, UserError, from_config
 from mpc_sgft.learning.agent import Agent
 from mpc_sgft.runs import build
-from mpc_sgft.runs.collect import Act, collect, planner_policy, score, shown
+from mpc_sgft.runs.collect import Act, collect, planner_policy, score, shown, succeeded
 from mpc_sgft.runs.explore import Collected, Round, policy_weights
 from mpc_sgft.storage import checkpoint, run_folder
 from mpc_sgft.storage.metrics import MetricLogger, progress
@@ -35,6 +35,7 @@ def pretrain(cfg: DictConfig) -> int:
     agent = start_agent(cfg, judge)
     round_size = cfg.num_envs * judge.task.episode_steps
     agent.imagined_steps = cfg.imagined_steps
+    curriculum = build.make_curriculum(cfg)
     buffer = instantiate(cfg.train.replay, seed=cfg.seed, device=agent.device)
     state = {"round": 0, "updates": 0, "transitions": 0, "episodes": 0, "seconds": 0.0, "streak": 0, "unstable": 0}
     watch = Stopwatch("wait", "update", "evaluate", "save")
@@ -46,13 +47,16 @@ def pretrain(cfg: DictConfig) -> int:
         state, watch.spent = stored["loop"], stored["spent"]
         agent.load_state_dict(stored["agent"])
         buffer.load_state_dict(stored["buffer"])
+        if curriculum is not None:
+            curriculum.load_state_dict(stored["curriculum"])
     with from_config("collector"):
         collector = instantiate(cfg.collector, _partial_=True)(cfg=cfg, sizes=agent.model.sizes)
 
     def plan_round(number: int) -> Round:
         """A round for the policy of now; the first ones act at random."""
         at_random = number * round_size < cfg.random_transitions
-        return Round(number, None if at_random else policy_weights(agent.model))
+        shapes = None if curriculum is None else tuple(map(tuple, curriculum.shapes.tolist()))
+        return Round(number, None if at_random else policy_weights(agent.model), shapes)
 
     def save() -> None:
         """Weights and exact state, at the end of a round."""
@@ -61,6 +65,7 @@ def pretrain(cfg: DictConfig) -> int:
         checkpoint.save(folder / "checkpoint" / "model.safetensors", agent.averaged, meta)
         ahead = collector.result().state_dict() if state["transitions"] < cfg.transitions else None
         parts = {"loop": state, "spent": watch.spent, "order": tuple(order), "ahead": ahead}
+        parts["curriculum"] = None if curriculum is None else curriculum.state_dict()
         checkpoint.save_state(saved, {**parts, "agent": agent.state_dict(), "buffer": buffer.state_dict()})
 
     stop = StopRequest("round")
@@ -87,10 +92,11 @@ def pretrain(cfg: DictConfig) -> int:
         state["transitions"] += data.numel()
         state["episodes"] = int(data["episode"].max()) + 1
         state["unstable"] += found.unstable
+        widened = curriculum.record(found.places, succeeded(data), found.shapes) if curriculum and found.shapes else {}
         order = plan_round(state["round"] + 1)
         if state["transitions"] < cfg.transitions:
             collector.start(order)
-        metrics: dict[str, float] = {"train_success": score(data).success}
+        metrics: dict[str, float] = {"train_success": score(data).success, **widened}
         agent.scale_learning_rates(0.5 ** (state["transitions"] / cfg.lr_halves_every))
         agent.hold_value(state["transitions"] <= cfg.hold_value)
         owed = int(state["transitions"] * cfg.updates_per_transition) - state["updates"]
@@ -143,6 +149,7 @@ def pretrain(cfg: DictConfig) -> int:
         "return": planned.episode_return,
         "unstable_episodes": state["unstable"],
         "wall_seconds": round(time.monotonic() - began, 1),
+        "randomize": None if curriculum is None else build.drawn_ranges(cfg, curriculum.shapes),
         "peak_memory_mb": peak_memory_mb(),
         "seconds": {part: round(seconds, 1) for part, seconds in watch.spent.items()},
         "checkpoint": str(folder / "checkpoint" / "model.safetensors"),

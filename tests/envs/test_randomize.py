@@ -37,6 +37,26 @@ def test_push_draws_what_its_table_says(make_backend) -> None:
     np.testing.assert_array_equal(drawn["body_mass"][:, others], np.tile(model.body_mass[others], (64, 1)))
 
 
+def test_a_place_in_a_range_is_a_number_of_its_unit() -> None:
+    flat = randomize.Draw(("dof_damping",), low=-1.0, high=3.0)
+    steep = randomize.Draw(("dof_damping",), low=0.5, high=8.0, distribution="loguniform")
+    assert [flat.value(x) for x in (0, 0.25, 1)] == [-1, 0, 3]
+    np.testing.assert_allclose([steep.value(x) for x in (0, 0.5, 1)], [0.5, 2, 8])
+
+
+def test_beta_distributions_take_the_place_of_uniform_ones(make_backend) -> None:
+    backend = make_backend("push", 400, randomised=True)
+    backend.randomizer.shapes = np.array([[1.0, 1.0], [90.0, 10.0], [1.0, 1.0], [2.0, 2.0]])  # in the table's order
+    backend.reset(np.arange(400))
+    places = backend.randomizer.places
+    np.testing.assert_allclose(places.mean(0), [0.5, 0.9, 0.5, 0.5], atol=0.06)
+    np.testing.assert_allclose(places.std(0), [12**-0.5, 0.03, 12**-0.5, 20**-0.5], rtol=0.15)
+    geom = backend.model.geom("puck").id
+    friction = _drawn(backend)["geom_friction"][:, geom, 0] / backend.model.geom_friction[geom, 0]
+    np.testing.assert_allclose(friction, 0.75 + 0.75 * places[:, 1])
+    assert len(np.unique(places)) == places.size
+
+
 def test_what_follows_from_the_mass_is_computed_anew(make_backend) -> None:
     backend = make_backend("push", N, randomised=True)
     backend.reset(np.arange(N))
@@ -139,14 +159,6 @@ def test_a_delay_that_the_buffer_cannot_hold_is_refused(make_backend, draw, mess
     with pytest.raises(ValueError) as error:
         make_backend("push", 1, draws={"latency": {**LATENCY["latency"], **draw}})
     assert message in str(error.value)
-
-
-def test_loguniform_spreads_over_magnitudes() -> None:
-    draw = randomize.Draw(fields=("body_mass",), low=0.01, high=100.0, distribution="loguniform")
-    rng = np.random.default_rng(0)
-    values = np.log10([draw.sample(rng) for _ in range(2000)])
-    assert -2 <= values.min() and values.max() <= 2
-    np.testing.assert_allclose(np.quantile(values, [0.25, 0.5, 0.75]), [-1, 0, 1], atol=0.15)
 
 
 @pytest.mark.parametrize(

@@ -81,6 +81,19 @@ def test_pretraining_resumes_with_the_same_numbers(pretrained, tmp_path):
     assert model.value_range == pytest.approx(float(rows(half)[-1]["scale"])) and model.value_range > 1.1
 
 
+def test_widening_randomisation_resumes_with_the_same_numbers(tmp_path):
+    words = "curriculum=doraemon", "curriculum.episodes=6", "curriculum.success=0.01", "collector=inline"
+    whole, half = tmp_path / "whole", tmp_path / "half"
+    for folder, much in ((whole, 1920), (half, 960)):
+        done = run("pretrain", f"run_dir={folder}", f"transitions={much}", *words)
+        assert done.returncode == 0, done.stderr
+    assert run("pretrain", "--resume", str(half), "transitions=1920").returncode == 0
+    ours, theirs = ([float(r["randomize_entropy"]) for r in rows(folder)] for folder in (whole, half))
+    assert ours == theirs
+    drawn = [json.loads((folder / "summary.json").read_text())["randomize"] for folder in (whole, half)]
+    assert drawn[0] == drawn[1] and drawn[0]
+
+
 def test_ctrl_c_saves_and_says_how_to_go_on(tmp_path):
     folder = tmp_path / "run"
     process = subprocess.Popen(

@@ -84,6 +84,15 @@ def test_found_effects_and_draws_combine():
     assert env.backend.model.body("payload_puck").mass[0] == 0.5
 
 
+def test_ranges_are_told_in_the_draws_own_units():
+    cfg = config(randomize={"draws": {"latency": {"low": 0.0, "high": 0.4}}})
+    shapes = torch.tensor([[1.0, 1.0]] * 3 + [[50.0, 50.0]], dtype=torch.float64)
+    found = build.drawn_ranges(cfg, shapes)
+    assert found["friction"] == [0.7875, 1.4625]
+    low, high = found["latency"]
+    assert low + high == pytest.approx(0.4) and high - low == pytest.approx(2 * 1.645 * 0.4 * 0.05, rel=0.02)
+
+
 def test_the_shares_of_the_workers_make_up_all_environments():
     for count, parts in ((64, 1), (10, 3), (3, 3)):
         shares = [share(count, part, parts) for part in range(parts)]
@@ -95,7 +104,7 @@ def test_a_process_collects_what_this_one_would(at_random):
     """A round is a function of its number and of the policy, and survives being written down."""
     cfg = config(num_envs=3)
     agent = build.make_agent(cfg, build.make_env(cfg, 1))
-    order = Round(5, None if at_random else policy_weights(agent.model))
+    order = Round(5, None if at_random else policy_weights(agent.model), ((9.0, 2.0),) * 4)
     found = []
     for collector in (Inline(cfg, agent.model.sizes), Process(cfg, agent.model.sizes)):
         collector.start(order)
@@ -103,8 +112,23 @@ def test_a_process_collects_what_this_one_would(at_random):
         collector.close()
     found.append(Collected.of(found[1].state_dict()))
     for other in found[1:]:
-        assert (found[0].steps == other.steps).all() and other.unstable == 0
+        assert (found[0].steps == other.steps).all() and other.unstable == 0 and other.shapes == order.shapes
+        torch.testing.assert_close(found[0].places, other.places, rtol=0, atol=0, equal_nan=True)
     assert found[0].steps.shape == (3, build.make_env(cfg, 1).task.episode_steps)
+
+
+def test_episodes_that_say_nothing_about_the_policy_tell_no_places():
+    """Random actions and detours fail for their own reasons; of the others, where their draws lie."""
+    cfg = config(num_envs=4)
+    agent = build.make_agent(cfg, build.make_env(cfg, 1))
+    collector = Inline(cfg, agent.model.sizes)
+    told, narrow = [], ((900.0, 100.0),) * 4
+    for weights, shapes in ((None, narrow), (policy_weights(agent.model), narrow), (policy_weights(agent.model), None)):
+        collector.start(Round(0, weights, shapes))
+        told.append(collector.result().places)
+    assert told[0].isnan().all() and told[1][:2].isnan().all()
+    assert (told[1][2:] - 0.9).abs().max() < 0.05
+    assert (told[2][2:] - 0.9).abs().max() > 0.1, "uniform again"
 
 
 def test_two_workers_number_their_episodes_one_after_the_other():
