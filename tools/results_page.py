@@ -58,6 +58,8 @@ def tasks() -> str:
     files = [f"tasks/{name}{method}.csv" for name in TASKS for method in ("", "_tdmpc2")]
     rows = [row for file in files if (RESULTS / file).exists() for row in read(file)]
     parts = [pick(read("tasks/pretrained.csv"), head), curves(rows, method_in_gap, "gap and method")]
+    kept = [{**row, "task": name} for name in ("hammer", "insert") for row in read(f"tasks/{name}_mild.csv")]
+    parts.append(f"In `mild`, where there is nothing to gain:\n\n{curves(kept, lambda row: row['task'], 'task')}")
     walked: dict[str, str | tuple[str, Callable[[str], str]]]
     walked = {"gap": "gap", "method": "method", "seed": "seed", "rollouts": "rollouts"}
     walked |= {"return": ("return", digits), "success": ("success", percent)}
@@ -186,6 +188,9 @@ def loop() -> str:
     head |= {"30 rollouts": ("final_before", percent), "after ": ("final_after", percent)}
     head |= {"rollouts to 95 %": "rollouts_to_95_before", "after  ": "rollouts_to_95_after"}
     parts = [pick(read("close_the_loop/close_the_loop.csv"), head)]
+    alone = {"gap": "gap", "seed": "seed", "found": "found"} | {k: head[k] for k in ("zero-shot", "after")}
+    identified = pick(read("close_the_loop/identify.csv"), alone)
+    parts.append(f"Identification alone, from ten rollouts of the policy that fails:\n\n{identified}")
     for file, says in (
         ("diagnose_run", "What was named"),
         ("diagnose_run_again", "Of others, with the present solver"),

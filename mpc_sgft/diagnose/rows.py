@@ -178,6 +178,7 @@ def reduction(signal: str, unit: str, before: Array, after: Array, rng: np.rando
     return {
         "signal": signal,
         "unit": unit,
+        "windows": len(before),
         "nominal": rms[0],
         "repaired": rms[1],
         "reduction": 1 - rms[1] / max(rms[0], 1e-300),

@@ -47,15 +47,29 @@ def existing(*names: str) -> list[Path]:
     return [RESULTS / name for name in names if (RESULTS / name).exists()]
 
 
+def files_of(tasks: dict[str, str]) -> list[str]:
+    return [f"tasks/{task}{method}.csv" for task in tasks.values() for method in ("", "_tdmpc2")]
+
+
 def of_tasks(tasks: dict[str, str], column: str = "success") -> Curves:
-    return values(
-        existing(*(f"tasks/{task}{method}.csv" for task in tasks.values() for method in ("", "_tdmpc2"))), column
-    )
+    return values(existing(*files_of(tasks)), column)
 
 
 def on_robot_tasks() -> Curves:
     """Push's gaps, and the realities of the other tasks."""
-    return values(existing("transfer/sgft.csv", "transfer/tdmpc2.csv", "benchmark/curves.csv")) | of_tasks(TASKS)
+    pushed = [f"transfer/{method}.csv" for method in ("sgft", "tdmpc2")]
+    methods = [f"benchmark/{name}.csv" for name in ("curves", "hammer", "push_ball")]
+    return values(existing(*pushed, *files_of(TASKS), *methods))
+
+
+def of_horizons() -> Curves:
+    """Each horizon's curve; H = 4, which all other runs have, is that of the transfer, as far as the others go."""
+    found, usual = values(existing("horizon/horizon.csv")), values(existing("transfer/sgft.csv"))
+    for gap, curves in found.items():
+        last = max(max(curve) for curve in curves.values())
+        if "sgft" in usual[gap]:
+            curves["sgft horizon=4"] = {n: x for n, x in usual[gap]["sgft"].items() if n <= last}
+    return found
 
 
 def drawn(curves: Curves, gaps: list[str], ylabel: str, columns: int = 4) -> Figure:
@@ -72,8 +86,10 @@ def drawn(curves: Curves, gaps: list[str], ylabel: str, columns: int = 4) -> Fig
         known |= dict(zip(curves[gap], axis.get_lines(), strict=True))
     for axis in list(axes.flat)[len(gaps) :]:
         axis.set_axis_off()
-    figure.tight_layout(rect=(0, 0, 1, 1 - 0.4 / figure.get_figheight()))
-    figure.legend(list(known.values()), list(known), loc="upper center", ncols=len(known), frameon=False)
+    across = min(len(known), 2 * columns)
+    lines = -(-len(known) // across)
+    figure.tight_layout(rect=(0, 0, 1, 1 - (0.15 + 0.25 * lines) / figure.get_figheight()))
+    figure.legend(list(known.values()), list(known), loc="upper center", ncols=across, frameon=False)
     return figure
 
 
@@ -206,7 +222,7 @@ def main() -> None:
     curves, returns, horizons = (
         on_robot_tasks(),
         of_tasks(SIM_TO_SIM, "return"),
-        values(existing("horizon/horizon.csv")),
+        of_horizons(),
     )
     pictures = {
         "4_success": (curves, [gap for gap in (*PUSH, *TASKS) if gap in curves], "success"),

@@ -70,8 +70,9 @@ def into(
     what, h = " + ".join(held.names) or "refitted quantities", data["held_out"]
     if not repairs:
         data["notes"].append(
-            f"no repaired.xml: with {what}, the error of {h['signal']} on windows that were never fitted does not "
-            f"credibly fall ({h['nominal']:.3g} -> {h['repaired']:.3g} {h['unit']})"
+            f"no repaired.xml: with {what}, errors on the {h['windows']} windows that were never fitted do not "
+            f"credibly fall ({h['signal']}: {h['nominal']:.3g} -> {h['repaired']:.3g} {h['unit']}). "
+            "More episodes tell more"
         )
         return
     data["repaired_model"], data["effects_file"] = FILES

@@ -85,6 +85,7 @@ TASKS = Path(__file__).parents[3] / "configs" / "task"
 HELD_OUT = {
     "signal": str,
     "unit": str,
+    "windows": int,
     "nominal": float,
     "repaired": float,
     "reduction": float,
