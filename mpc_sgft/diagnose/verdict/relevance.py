@@ -101,16 +101,31 @@ def shares_of(
     return out
 
 
-def repairs(setup: Setup[Any], held: Hypothesis, there: Hypothesis, base: Hypothesis, rng: np.random.Generator) -> bool:
+class Repairs(NamedTuple):
+    """Whether a set lowers errors, and on which windows that shows, in words."""
+
+    lowers: bool
+    on: str
+
+
+def repairs(
+    setup: Setup[Any], held: Hypothesis, there: Hypothesis, base: Hypothesis, rng: np.random.Generator
+) -> Repairs:
     """Whether a set lowers the error of windows that were never fitted: credibly in most, and not less in the mean.
 
     Squared errors of windows differ by orders of magnitude, so that a few of them decide a mean: what is judged is the
-    logarithm, and the mean is that of windows which `there` foretells.
+    logarithm, and the mean is that of windows which `there` foretells. Fewer than `judge.FEW` windows show nothing for
+    certain: then those that were fitted count as well, each foretold by the others.
     """
     first = len(setup.fitted) * setup.parts
     told = foretold(setup, there)[first:]
     before, after = (float((told * setup.squared(e.errors[first:])).mean()) for e in (base, held))
-    return after < before and judge.gain(base.errors[first:], held.errors[first:], 0.90, rng).low > 0
+    apart = f"the {len(setup.held)} windows that were never fitted"
+    if after >= before:
+        return Repairs(False, apart)
+    if len(told) < judge.FEW:
+        first, apart = 0, f"all {len(setup.fitted) + len(setup.held)} windows, each foretold by the others"
+    return Repairs(judge.gain(base.errors[first:], held.errors[first:], 0.90, rng).low > 0, apart)
 
 
 def foretold(setup: Setup[Any], best: Hypothesis) -> Array:

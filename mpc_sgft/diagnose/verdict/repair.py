@@ -14,6 +14,7 @@ from mpc_sgft.diagnose.candidates.library import as_gap, settings
 from mpc_sgft.diagnose.candidates.nominal import scale
 from mpc_sgft.diagnose.fitting.hypothesis import Hypothesis
 from mpc_sgft.diagnose.simulation.plant import FORCE, Plant
+from mpc_sgft.diagnose.verdict.relevance import Repairs
 
 
 def diff(nominal: mujoco.MjSpec, repaired: Path) -> str:
@@ -51,7 +52,7 @@ FILES = ("repaired.xml", "effects.yaml")
 
 
 def into(
-    out: Path, data: dict[str, Any], held: Hypothesis, repairs: bool, write_files: Callable[[], list[str]]
+    out: Path, data: dict[str, Any], held: Hypothesis, repairs: Repairs, write_files: Callable[[], list[str]]
 ) -> None:
     """Write the repair into a folder if it repairs, and say so in the report: those of an earlier report go.
 
@@ -59,7 +60,7 @@ def into(
         out: The folder.
         data: Of the report.
         held: What the repair holds.
-        repairs: Whether it credibly lowers the error of windows that were never fitted.
+        repairs: Whether it credibly lowers errors.
         write_files: Writes repaired.xml and effects.yaml, and returns notes.
     """
     out.mkdir(parents=True, exist_ok=True)
@@ -68,15 +69,15 @@ def into(
     if not held.fit.terms:
         return
     what, h = " + ".join(held.names) or "refitted quantities", data["held_out"]
-    if not repairs:
+    if not repairs.lowers:
         data["notes"].append(
-            f"no repaired.xml: with {what}, errors on the {h['windows']} windows that were never fitted do not "
-            f"credibly fall ({h['signal']}: {h['nominal']:.3g} -> {h['repaired']:.3g} {h['unit']}). "
+            f"no repaired.xml: with {what}, errors on {repairs.on} do not credibly fall "
+            f"(never fitted, {h['signal']}: {h['nominal']:.3g} -> {h['repaired']:.3g} {h['unit']}). "
             "More episodes tell more"
         )
         return
     data["repaired_model"], data["effects_file"] = FILES
-    data["notes"] += write_files()
+    data["notes"] += [f"repaired.xml: errors credibly fall on {repairs.on}", *write_files()]
     if data["verdict"] == "unknown":
         data["notes"].append(
             f"repaired.xml and effects.yaml hold {what}: a fit that takes part of the error away, not its name"

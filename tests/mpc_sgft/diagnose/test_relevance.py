@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,6 +15,9 @@ import yaml
 from mpc_sgft.command.errors import UserError
 from mpc_sgft.diagnose import diagnose
 from mpc_sgft.diagnose.__main__ import main
+from mpc_sgft.diagnose.data.measured import Array
+from mpc_sgft.diagnose.fitting.hypothesis import Hypothesis
+from mpc_sgft.diagnose.verdict.relevance import Repairs, repairs
 from mpc_sgft.diagnose.verdict.tolerance import limits_of, parse_tolerance
 
 FEW = ["viscous_friction", "coulomb_friction", "quadratic_drag", "actuator_offset"]
@@ -61,6 +66,30 @@ def test_a_repair_that_does_not_repair_is_not_written(slide: Path, record: Recor
     assert report["effects_file"] is None and not (tmp_path / "out" / "repaired.xml").exists()
     told = f"errors on the {report['held_out']['windows']} windows that were never fitted do not credibly fall"
     assert any("no repaired.xml" in n and told in n for n in report["notes"]), report["notes"]
+
+
+@pytest.mark.parametrize(
+    ("held_drops", "fitted_drop", "lowers", "on"),
+    [
+        ([0.1, 4.0, 0.2, 0.1, 0.1], 0.5, True, "all 20 windows, each foretold by the others"),
+        ([0.1, 4.0, 0.2, 0.1, 0.1], -0.5, False, "all 20 windows, each foretold by the others"),
+        ([-0.1, -4.0, -0.2, -0.1, -0.1], 2.0, False, "the 5 windows that were never fitted"),
+        ([0.5, 0.6] * 6, -9.0, True, "the 12 windows that were never fitted"),
+    ],
+)
+def test_few_windows_apart_leave_the_word_to_all(
+    held_drops: list[float], fitted_drop: float, lowers: bool, on: str
+) -> None:
+    """Five windows, one of which tells far more than the others, show nothing for certain by themselves."""
+    held, fitted = len(held_drops), 15
+    setup: Any = SimpleNamespace(fitted=np.arange(fitted), held=np.arange(held), parts=1, squared=np.expm1)
+    drops = np.array([fitted_drop] * fitted + held_drops)
+    base, better = (judged(np.full(fitted + held, 10.0) - d) for d in (0.0, drops))
+    assert repairs(setup, better, better, base, np.random.default_rng(0)) == Repairs(lowers, on)
+
+
+def judged(errors: Array) -> Hypothesis:
+    return Hypothesis(fit=None, effects=1, errors=errors, fitted=errors, complexity=1)  # type: ignore[arg-type]
 
 
 def test_tolerances_have_units_of_their_signals() -> None:
