@@ -18,10 +18,14 @@ class Gate(NamedTuple):
         margin: They must lower the error to this share of the pretrained error, in the geometric mean over the last
             `memory` rollouts: one odd rollout shuts nothing.
         memory: Rollouts that the gate looks back on.
+        excess: The dynamics beneath the maps act fine-tuned only where, as they were pretrained, they predict these
+            rollouts this many times worse than simulated ones: no network is exact, and what it also gets wrong in
+            simulation is no gap. 0: wherever the maps act.
     """
 
     margin: float
     memory: int
+    excess: float = 0.0
 
 
 class AbstractMethod(ABC):

@@ -1,16 +1,18 @@
 """Learning from few real rollouts without losing what the simulator taught.
 
-The dynamics and the policy that act are not simply the ones that train. A model fine-tuned on two hundred
-transitions of five rollouts has forgotten what it knew elsewhere, and where zero-shot already worked that does harm. So
-each new rollout is first a test: it has not been trained on, and the pretrained and the fine-tuned dynamics both
-predict it. The fine-tuned parts act once they have predicted such rollouts clearly better; until then the pretrained
-do. What is tested and acts is the average of the weights over the last updates, since the last ones alone are one draw
-of many; of the policy prior, a share of the way from the pretrained one (Wortsman et al., "Robust fine-tuning of
-zero-shot models", CVPR 2022).
+The dynamics and the policy that act are not simply the ones that train. A model fine-tuned on two hundred transitions
+of five rollouts has forgotten what it knew elsewhere, and where zero-shot already worked that does harm. So each new
+rollout is first a test: it has not been trained on, and the pretrained and the fine-tuned dynamics both predict it. The
+fine-tuned parts act once they have predicted such rollouts clearly better; until then the pretrained do. Better at what
+a policy does every time is not better where it does not go, though, and a planner looks there: so the dynamics beneath
+the maps may stay the simulator's where these predict reality as well as they do simulation. What is tested and acts is
+the average of the weights over the last updates, since the last ones alone are one draw of many; of the policy prior, a
+share of the way from the pretrained one (Wortsman et al., "Robust fine-tuning of zero-shot models", CVPR 2022).
 """
 
 import copy
 import math
+import statistics
 from collections.abc import Callable, Iterable
 from functools import partial
 from typing import NamedTuple, cast
@@ -25,6 +27,7 @@ from mpc_sgft.learning.method import AbstractMethod
 from mpc_sgft.learning.observation_map import Sensed
 from mpc_sgft.learning.world_model import WorldModel
 
+SIMULATED = 32  # episodes that tell how well the pretrained dynamics predict what they were made for
 SHARED = "observation", "action", "episode", "step", *(("next", k) for k in ("observation", "reward", "terminated"))
 
 
@@ -34,6 +37,8 @@ class Verdict(NamedTuple):
     pretrained: float  # latent error over the horizon, mean over steps
     fine_tuned: float
     accepted: bool  # the fine-tuned parts act in the next rollout
+    mapped: float | None = None  # of the pretrained dynamics with the learned maps, where the gate asks
+    beneath: bool = True  # the dynamics beneath the maps are among the parts that act then
 
 
 class Transfer:
@@ -45,7 +50,8 @@ class Transfer:
         capacity: Real transitions to hold.
         batch_size, seed: Of the replay slices.
         sensed: As in `AbstractMethod.take_over`.
-        simulated: Gives as many simulated episodes [N, T] as it is asked for; only methods that learn from some ask.
+        simulated: Gives as many simulated episodes [N, T] as it is asked for; asked by methods that learn from some,
+            and by a gate that compares with them.
 
     Raises:
         ValueError: If simulated episodes are wanted and there is nothing that makes them.
@@ -73,6 +79,13 @@ class Transfer:
             sizes["batch_size"] = batch_size // 2
             self.simulated = make_buffer(steps.numel(), **sizes)
             self.simulated.extend(steps)
+        self.simulated_error = 0.0  # geometric mean of the pretrained dynamics' error over simulated episodes
+        if method.gate and method.gate.excess:
+            if simulated is None:
+                raise ValueError(
+                    f"gate_excess={method.gate.excess} compares with simulation: give what makes episodes."
+                )
+            self.simulated_error = mean_error(agent.model, simulated(SIMULATED), method.slice_len)
         method.take_over(agent, sensed)
         self._new_buffer = partial(make_buffer, capacity, **sizes)
         self.buffer = self._new_buffer()
@@ -83,16 +96,19 @@ class Transfer:
         self.starts: list[torch.Tensor] = []  # first observation of each rollout
 
     def judge(self, steps: TensorDict) -> Verdict:
-        """Test both dynamics on a rollout [T] before it is learned from, and decide who acts next."""
-        pretrained, fine_tuned = (
-            float(open_loop_error(model, steps, self.slice_len).nanmean())
-            for model in (self.pretrained, self.averaged.model)
-        )
-        gate = self.method.gate
-        self.verdicts.append(Verdict(pretrained, fine_tuned, gate is None))
-        recent = self.verdicts[1:][-gate.memory :] if gate else []  # at the first rollout the two are still the same
+        """Test the dynamics on a rollout [T] before it is learned from, and decide who acts next."""
+        gate, models = self.method.gate, [self.pretrained, self.averaged.model]
+        if gate and gate.excess:
+            models.append(copy.deepcopy(self.averaged.model))
+            self._simulate_beneath(models[-1])
+        errors = [float(open_loop_error(model, steps, self.slice_len).nanmean()) for model in models]
+        self.verdicts.append(Verdict(*errors[:2], gate is None, *errors[2:]))
+        recent = self.verdicts[1:][-gate.memory :] if gate else []  # at the first rollout all are still the same
         if gate and recent:
-            self.verdicts[-1] = self.verdicts[-1]._replace(accepted=clearly_better(recent, gate.margin))
+            mapped = [v.mapped for v in recent if v.mapped is not None]
+            beneath = not mapped or statistics.geometric_mean(mapped) > gate.excess * self.simulated_error
+            accepted = clearly_better(recent, gate.margin)
+            self.verdicts[-1] = self.verdicts[-1]._replace(accepted=accepted, beneath=beneath)
         return self.verdicts[-1]
 
     def learn(self, steps: TensorDict, track: Callable[[range], Iterable[int]] = iter) -> dict[str, float]:
@@ -109,8 +125,9 @@ class Transfer:
         for _ in track(range(self.method.updates)):
             metrics = self.method.update(self.agent, self.batch(), starts=starts)
             self.averaged.follow(self.agent.model)
-        self._hand_over(verdict.accepted)
-        return metrics | {"error_pretrained": verdict.pretrained, "error_fine_tuned": verdict.fine_tuned}
+        self._hand_over(verdict)
+        metrics |= {"error_pretrained": verdict.pretrained, "error_fine_tuned": verdict.fine_tuned}
+        return metrics if verdict.mapped is None else metrics | {"error_mapped": verdict.mapped}
 
     def batch(self) -> TensorDictBase:
         """What an update learns from, [B, T]: real slices, and as many simulated ones if the method wants them."""
@@ -120,10 +137,19 @@ class Transfer:
         return cast(TensorDictBase, TensorDict.cat(parts))
 
     @torch.no_grad()
-    def _hand_over(self, accepted: bool) -> None:
-        self.acting.load_state_dict((self.averaged.model if accepted else self.pretrained).state_dict())
+    def _hand_over(self, verdict: Verdict) -> None:
+        self.acting.load_state_dict((self.averaged.model if verdict.accepted else self.pretrained).state_dict())
+        if not verdict.beneath:
+            self._simulate_beneath(self.acting)
         priors = self.acting.policy_head.parameters(), self.pretrained.policy_head.parameters()
         torch._foreach_lerp_([*priors[0]], [*priors[1]], 1 - self.method.policy_share)  # type: ignore
+
+    def _simulate_beneath(self, model: WorldModel) -> None:
+        """Put the pretrained dynamics beneath a model's maps."""
+        for name in ("base", "residual"):
+            part = getattr(model.dynamics, name)
+            if part is not None:
+                part.load_state_dict(getattr(self.pretrained.dynamics, name).state_dict())
 
     def state_dict(self) -> dict:
         return {
@@ -153,6 +179,11 @@ class Transfer:
 def clearly_better(verdicts: list[Verdict], margin: float) -> bool:
     """Whether fine-tuning lowered the geometric mean of the errors to less than `margin` of the pretrained one."""
     return math.prod(v.fine_tuned for v in verdicts) < math.prod(margin * v.pretrained for v in verdicts)
+
+
+def mean_error(model: WorldModel, episodes: TensorDict, horizon: int) -> float:
+    """Geometric mean over episodes [N, T] of the mean `open_loop_error`."""
+    return statistics.geometric_mean(float(open_loop_error(model, steps, horizon).nanmean()) for steps in episodes)
 
 
 @torch.inference_mode()

@@ -45,7 +45,7 @@ class SGFT(AbstractMethod):
             entry, once rollouts start where none does in simulation. Found like the command map, by what the
             simulator's dynamics can explain, and by where rollouts start.
         start_weight: Weight of the squared distance from there.
-        gate, gate_margin, gate_memory: Whether there is a gate, and its numbers (`Gate`).
+        gate, gate_margin, gate_memory, gate_excess: Whether there is a gate, and its numbers (`Gate`).
         updates, slice_len, action_noise, average_decay, policy_share: As in `AbstractMethod`.
 
     Raises:
@@ -76,6 +76,7 @@ class SGFT(AbstractMethod):
         gate: bool,
         gate_margin: float,
         gate_memory: int,
+        gate_excess: float,
         updates: int,
         slice_len: int,
         action_noise: float,
@@ -84,7 +85,7 @@ class SGFT(AbstractMethod):
         self.horizon, self.lr, self.policy_lr, self.command_lr = horizon, lr, policy_lr, command_lr
         self.entropy_coef, self.rho, self.anchor = entropy_coef, rho, anchor
         self.residual, self.command_map, self.command_sparsity = residual, command_map, command_sparsity
-        self.gate = Gate(gate_margin, gate_memory) if gate else None
+        self.gate = Gate(gate_margin, gate_memory, gate_excess) if gate else None
         self.updates, self.slice_len, self.action_noise = updates, slice_len, action_noise
         self.observation_map, self.observation_lr, self.start_weight = observation_map, observation_lr, start_weight
         self.lr_decay, self.average_decay, self.policy_share = lr_decay, average_decay, policy_share

@@ -103,6 +103,36 @@ def test_without_the_gate_what_trains_acts_at_once():
     assert same(t.acting, t.agent.model) and not same(t.acting, t.pretrained)
 
 
+@pytest.mark.parametrize(("excess", "beneath"), [(0.5, True), (2.0, False)])
+def test_the_dynamics_beneath_the_maps_stay_where_simulation_is_predicted_as_badly(excess: float, beneath: bool):
+    """Real and simulated steps are alike here, so their errors are."""
+    numbers = {"gate_excess": excess, "command_map": True, "updates": 60, "lr": 1e-2, "gate_margin": 0.98}
+    agent = make_agent(MEMORY)
+    simulated = torch.stack([rollout(agent.model, seed=seed) for seed in range(32)])
+    asked = []
+
+    def simulate(episodes: int) -> TensorDict:
+        asked.append(episodes)
+        return simulated
+
+    t = Transfer(agent, make_sgft(**numbers), SENSED, capacity=200, batch_size=16, seed=0, simulated=simulate)
+    for _ in range(2):
+        t.learn(simulated[0])
+    verdict, acting, learned = t.verdicts[-1], t.acting.dynamics, t.averaged.model.dynamics
+    assert asked == [32] and verdict.accepted and verdict.beneath is beneath
+    errors = torch.stack([open_loop_error(t.pretrained, steps, 2).nanmean() for steps in simulated])
+    assert t.simulated_error == pytest.approx(float(errors.log().mean().exp()), rel=1e-5)
+    assert torch.equal(acting.command.weight, learned.command.weight)
+    wanted = learned.base if beneath else t.pretrained.dynamics.base
+    assert not torch.equal(learned.base[0].linear.weight, t.pretrained.dynamics.base[0].linear.weight)
+    assert torch.equal(acting.base[0].linear.weight, wanted[0].linear.weight)
+
+
+def test_a_comparison_with_simulation_needs_simulated_episodes():
+    with pytest.raises(ValueError, match="give what makes episodes"):
+        transfer(of_method={"gate_excess": 2.0})
+
+
 def test_what_acts_is_the_average_of_the_last_updates_with_a_share_of_the_policy_s_change():
     decay, share, updates = 0.5, 0.25, 3
     t = transfer(gate=False, updates=updates, of_method={"average_decay": decay, "policy_share": share})
