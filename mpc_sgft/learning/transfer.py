@@ -97,16 +97,20 @@ class Transfer:
 
     def judge(self, steps: TensorDict) -> Verdict:
         """Test the dynamics on a rollout [T] before it is learned from, and decide who acts next."""
-        gate, models = self.method.gate, [self.pretrained, self.averaged.model]
+
+        def error(model: WorldModel) -> float:
+            return float(open_loop_error(model, steps, self.slice_len).nanmean())
+
+        gate, mapped = self.method.gate, None
         if gate and gate.excess:
-            models.append(copy.deepcopy(self.averaged.model))
-            self._simulate_beneath(models[-1])
-        errors = [float(open_loop_error(model, steps, self.slice_len).nanmean()) for model in models]
-        self.verdicts.append(Verdict(*errors[:2], gate is None, *errors[2:]))
+            simulator = copy.deepcopy(self.averaged.model)
+            self._simulate_beneath(simulator)
+            mapped = error(simulator)
+        self.verdicts.append(Verdict(error(self.pretrained), error(self.averaged.model), gate is None, mapped))
         recent = self.verdicts[1:][-gate.memory :] if gate else []  # at the first rollout all are still the same
         if gate and recent:
-            mapped = [v.mapped for v in recent if v.mapped is not None]
-            beneath = not mapped or statistics.geometric_mean(mapped) > gate.excess * self.simulated_error
+            errors = [v.mapped for v in recent if v.mapped is not None]
+            beneath = not errors or statistics.geometric_mean(errors) > gate.excess * self.simulated_error
             accepted = clearly_better(recent, gate.margin)
             self.verdicts[-1] = self.verdicts[-1]._replace(accepted=accepted, beneath=beneath)
         return self.verdicts[-1]
