@@ -128,6 +128,12 @@ def test_the_dynamics_beneath_the_maps_stay_where_simulation_is_predicted_as_bad
     assert torch.equal(acting.base[0].linear.weight, wanted[0].linear.weight)
 
 
+@pytest.mark.parametrize("numbers", [{"gate_excess": -1.0}, {"gate_excess": 2.0, "gate": False}])
+def test_an_excess_that_would_do_nothing_is_refused(numbers: dict):
+    with pytest.raises(ValueError, match="must be 0 or more, and 0 with gate=false"):
+        make_sgft(**numbers)
+
+
 def test_a_comparison_with_simulation_needs_simulated_episodes():
     with pytest.raises(ValueError, match="give what makes episodes"):
         transfer(of_method={"gate_excess": 2.0})
