@@ -9,7 +9,8 @@ import yaml
 from latex2mathml.converter import convert
 
 from mpc_sgft.command import choices
-from tools import results_page
+from tools import results_page, timing_tables
+from tools.ladder_table import ladder
 from tools.tables import RESULTS, table
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -27,12 +28,12 @@ def on_pre_build(config: Any) -> None:
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
     """Fill the places that are marked {{ so }}."""
-    fills = {"results": results_page.page, "ladder": results_page.ladder}
+    fills = {"results": results_page.page, "ladder": ladder}
     fills |= {
-        "collect": results_page.collect,
-        "growth": results_page.growth,
-        "gpu": results_page.gpu,
-        "thousand": results_page.thousand,
+        "collect": timing_tables.collect,
+        "growth": timing_tables.growth,
+        "gpu": timing_tables.gpu,
+        "thousand": timing_tables.thousand,
         "settings": settings,
     }
     for name, fill in {**fills, "effects": effects}.items():

@@ -22,7 +22,7 @@ from mpc_sgft.learning.transfer import Transfer, open_loop_error
 from mpc_sgft.runs import build, robot
 from mpc_sgft.runs.collect import Score, collect, planner_policy, score, score_of
 from mpc_sgft.runs.explore import explored
-from mpc_sgft.runs.pretrain import StopRequest, evaluation_seed
+from mpc_sgft.runs.pretrain import StopRequest, Stopwatch, evaluation_seed
 from mpc_sgft.runs.real_rollout import begin, drive, start_seed
 from mpc_sgft.session import person
 from mpc_sgft.session.operator import Nobody, Operator
@@ -105,8 +105,11 @@ class Deployment:
         self.state: dict[str, Any] = {"rollouts": 0, "aborted": 0, "scores": {}, "seconds": 0.0, "successes": 0}
         self.state |= {"interventions": 0, "rerecorded": 0, "updates": 0}
         self.state["outcomes"] = []  # (success, return) of each real rollout
+        self.watch = Stopwatch("rollout", "learn", "evaluate")
+        self.state["spent"] = self.watch.spent
         if cfg.resume is not None:
             self._resume()
+            self.watch.spent = self.state["spent"]
         self.logger = self.make_logger(self.state["rollouts"] if cfg.resume is not None else None)
         self.metrics: dict[str, float] = {}  # of the last rollout
         self.verdicts = Verdicts(self, ask=person.asks(cfg))
@@ -132,7 +135,8 @@ class Deployment:
         self.show_counts()
         while self.state["rollouts"] < cfg.rollouts:
             number = self.state["rollouts"] + 1
-            rollout = self._rollout(number)
+            with self.watch("rollout"):
+                rollout = self._rollout(number)
             if rollout is not None:
                 rollout = self.verdicts.of(rollout, number)
             if self.operator.stopping:
@@ -158,7 +162,8 @@ class Deployment:
         valid = rollout.steps[~rollout.steps["next", "invalid"][:, 0]]
         if len(valid) >= self.transfer.slice_len and not rollout.intervened:
             self.operator.enter("training", number)
-            metrics |= self.transfer.learn(valid, self.operator.track)
+            with self.watch("learn"):
+                metrics |= self.transfer.learn(valid, self.operator.track)
             self.state["updates"] += self.transfer.method.updates
         self.state["rollouts"] = number
         self.state["aborted"] += rollout.aborted is not None
@@ -254,7 +259,8 @@ class Deployment:
 
     def evaluate(self, table: GrowingTable | None, metrics: dict[str, float]) -> None:
         """Measure success now: into the state, `metrics` and the table."""
-        result = self._score()
+        with self.watch("evaluate"):
+            result = self._score()
         self.state["scores"][self.state["rollouts"]] = result._asdict()
         metrics |= {"success": result.success, "return": result.episode_return}
         if self.viewer:
@@ -321,6 +327,7 @@ class Deployment:
             "horizon": cfg.planner.horizon,
             "frozen_sha256": self.frozen,
             "wall_seconds": round(time.monotonic() - self.began, 1),
+            "seconds": self.watch.rounded(),
             "robot": self.env.backend.report() if self.judge is None else None,
             "rrd": str(self.folder / "run.rrd") if self.viewer else None,
         }

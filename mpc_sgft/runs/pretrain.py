@@ -151,7 +151,7 @@ def pretrain(cfg: DictConfig) -> int:
         "wall_seconds": round(time.monotonic() - began, 1),
         "randomize": None if curriculum is None else build.drawn_ranges(cfg, curriculum.shapes),
         "peak_memory_mb": peak_memory_mb(),
-        "seconds": {part: round(seconds, 1) for part, seconds in watch.spent.items()},
+        "seconds": watch.rounded(),
         "checkpoint": str(folder / "checkpoint" / "model.safetensors"),
     }
     (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
@@ -207,6 +207,10 @@ class Stopwatch:
         start = time.monotonic()
         yield
         self.spent[part] += time.monotonic() - start
+
+    def rounded(self) -> dict[str, float]:
+        """Seconds by part, for a summary."""
+        return {part: round(seconds, 1) for part, seconds in self.spent.items()}
 
 
 class StopRequest:

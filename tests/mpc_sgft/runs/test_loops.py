@@ -112,6 +112,8 @@ def test_the_summary_holds_what_scripts_read(deployed):
     assert summary["real_rollouts"] == 4 and summary["gap"] == "pendulum_torque"
     config = OmegaConf.load(deployed / "config.yaml")
     assert summary["updates"] == 4 * config.method.updates > 0
+    parts = summary["seconds"]
+    assert set(parts) == {"rollout", "learn", "evaluate"} and 0 < sum(parts.values()) < summary["wall_seconds"] + 0.2
     assert len(list((deployed / "episodes").glob("*.mcap"))) == 4
     told = {row["step"]: float(row["return"]) for row in rows(deployed) if row["return"]}
     returns = summary["return_curve"]
@@ -164,10 +166,14 @@ def test_a_killed_deployment_loses_at_most_the_step_in_flight(pretrained, tmp_pa
     process.wait()
     kept = len(read_episode(second).transitions["step"])
     assert kept >= 5
+    state = checkpoint.load_state(folder / "checkpoint" / "state.pt")
+    state["loop"]["spent"]["learn"] += 100
+    checkpoint.save_state(folder / "checkpoint" / "state.pt", state)
     done = run("deploy", "--resume", str(folder))
     assert done.returncode == 0, done.stderr
     summary = json.loads((folder / "summary.json").read_text())
     assert summary["real_rollouts"] == 3 and summary["aborted_rollouts"] <= 1
+    assert summary["seconds"]["learn"] >= 100
     assert len(read_episode(second).transitions["step"]) == kept  # what happened is not driven again
     assert read_episode(folder / "episodes" / "0003.mcap").complete
 
