@@ -138,11 +138,8 @@ def fit_soft(
     if penalty is not None:
         metrics["q_penalty"] = penalty(model.two_hot.decode(logits))
     check_finite(metrics)
-    critics = list(model.q_ensemble.parameters())
-    agent.model_optimizer.zero_grad()
-    torch.stack([*metrics.values()]).sum().backward(inputs=critics)
-    metrics["q_grad_norm"] = torch.nn.utils.clip_grad_norm_(critics, agent.grad_clip, foreach=True)
-    agent.model_optimizer.step()
+    total = torch.stack([*metrics.values()]).sum()
+    metrics["q_grad_norm"] = agent.step_model(total, [*model.q_ensemble.parameters()])
     action, log_prob = model.policy(found.z, agent.noise(len(found.z)))
     worth = model.q(found.z, action, heads=agent.two_heads()).amin(0)
     metrics |= agent.step_policy((entropy_coef * log_prob - worth).mean(), log_prob)

@@ -1,8 +1,7 @@
 """World model + optimisers: update() is the TD-MPC2 objective; what methods of deployment add is in fit.py."""
 
-import copy
 import hashlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -12,12 +11,12 @@ from torch import Tensor
 
 from mpc_sgft.learning import losses
 from mpc_sgft.learning.averaged import AveragedWeights
+from mpc_sgft.learning.optimizers import PRETRAINED, Optimizers
 from mpc_sgft.learning.precision import dtype_of_products, in_own_precision
 from mpc_sgft.learning.slices import FiniteWatch, Slices, arranged, floats
 from mpc_sgft.learning.world_model import WorldModel
 from planners.cuda_graph import CudaGraphs, addresses
 
-PRETRAINED = ("encoder", "dynamics", "reward_head", "q_ensemble", "value_head", "policy_head", "decoder")
 FOLLOWING = ("normalizer", "target_q")  # not by gradient
 
 
@@ -99,14 +98,8 @@ class Agent:
         return self._averaged.model
 
     def scale_learning_rates(self, share: float) -> None:
-        """Set the pretraining learning rates to a share of the configured ones."""
-        for optimizer in (self.model_optimizer, self.policy_optimizer):
-            for group in optimizer.param_groups:
-                rate = share * group.setdefault("full_lr", float(group["lr"]))
-                if isinstance(group["lr"], Tensor):
-                    group["lr"].fill_(rate)
-                else:
-                    group["lr"] = rate
+        """Set the learning rates of model and policy prior to a share of the configured ones."""
+        self.optimizers.scale(share)
 
     def hold_value(self, held: bool) -> None:
         """Whether encoder and V stay as they are while everything else learns in simulation."""
@@ -148,7 +141,7 @@ class Agent:
             finally:
                 self.generator, self._watch = kept
 
-        trains = tuple(p.requires_grad for p in self.model_parameters)
+        trains = tuple(p.requires_grad for p in self.optimizers.trained)
         where = self.model.training, addresses(self.model)
         key = (policy_too, self.imagined_steps, trains, data.action.shape, *where)
         self._watch.also(graphs(key, step, data, self.generator))
@@ -179,10 +172,7 @@ class Agent:
         total = torch.stack([self.weights[name] * loss for name, loss in metrics.items()]).sum()
         self._note(metrics, read)
         metrics["loss"] = total
-        self.model_optimizer.zero_grad()
-        total.backward()
-        metrics["grad_norm"] = torch.nn.utils.clip_grad_norm_(self.model_parameters, self.grad_clip, foreach=True)
-        self.model_optimizer.step()
+        metrics["grad_norm"] = self.step_model(total)
 
         if policy_too:
             imagine = self.pretraining and self.imagined_steps > 0
@@ -228,21 +218,29 @@ class Agent:
         metrics = self.step_policy(coef * log_prob.mean() - objective.mean() / scale, log_prob, read)
         return metrics | {"objective": objective.mean(), "scale": scale}, log_prob
 
+    def step_model(self, loss: Tensor, parameters: Sequence[Tensor] | None = None) -> Tensor:
+        """A step of the model down a loss, of these parameters or of all that train; returns the slope's length."""
+        self.optimizers.model.zero_grad()
+        loss.backward(inputs=parameters)
+        length = torch.nn.utils.clip_grad_norm_(parameters or self.optimizers.trained, self.grad_clip, foreach=True)
+        self.optimizers.model.step()
+        return length
+
     def step_policy(self, loss: Tensor, log_prob: Tensor, read: bool = True) -> dict[str, Tensor]:
         """A step of the policy prior down a loss of its own actions, whose log-density is given."""
         self._note({"policy_loss": loss}, read)
         parameters = list(self.model.policy_head.parameters())
-        self.policy_optimizer.zero_grad()
+        self.optimizers.policy.zero_grad()
         loss.backward(inputs=parameters)  # nothing else collects a gradient here
         torch.nn.utils.clip_grad_norm_(parameters, self.grad_clip, foreach=True)
-        self.policy_optimizer.step()
+        self.optimizers.policy.step()
         return {"policy_loss": loss, "entropy": -log_prob.mean()}
 
     def _tune_entropy(self, log_prob: Tensor) -> None:
         if self.entropy_lr:
-            self.entropy_optimizer.zero_grad()
+            self.optimizers.entropy.zero_grad()
             losses.entropy_coef_loss(self.log_entropy_coef, log_prob, -float(self.model.action_dim)).backward()
-            self.entropy_optimizer.step()
+            self.optimizers.entropy.step()
 
     # -- what methods of deployment use --------------------------------------------------------------------------------
 
@@ -290,17 +288,16 @@ class Agent:
     def snapshot(self) -> dict[str, Any]:
         """Copy of what trains: parameters and optimisers. Give it to `restore` to undo updates."""
         state = {name: x.detach().clone() for name, x in self.model.state_dict().items() if self._trains(name)}
-        optimizers = {name: copy.deepcopy(o.state_dict()) for name, o in self._optimizers().items()}
         rest = {"log_entropy_coef": self.log_entropy_coef.detach().clone(), "scale": self.scale.value.clone()}
-        return {"model": state, "optimizers": optimizers, **rest}
+        return {"model": state, "optimizers": self.optimizers.state_dict(), **rest}
 
     @torch.no_grad()
     def restore(self, snapshot: Mapping[str, Any]) -> None:
         """Undo every update since `snapshot` was taken; the noise generator goes on."""
         self.model.load_state_dict(snapshot["model"], strict=False)
-        for name, optimizer in self._optimizers().items():
-            optimizer.load_state_dict(copy.deepcopy(snapshot["optimizers"][name]))
-        self._prepare_for_graphs()
+        self.optimizers.load_state_dict(snapshot["optimizers"])
+        if self._graphs is not None:
+            self._graphs.clear()  # what they read has moved
         self.log_entropy_coef.copy_(snapshot["log_entropy_coef"])
         self.scale.value.copy_(snapshot["scale"])
 
@@ -349,35 +346,19 @@ class Agent:
     def _make_optimizers(
         self, lr: float, policy_lr: float, command_lr: float | None = None, observation_lr: float | None = None
     ) -> None:
-        model = self.model
-        maps = ((model.dynamics.command, command_lr), (model.observation_map, observation_lr))
-        groups = [{"params": [*part.parameters()], "lr": lr if own is None else own} for part, own in maps if part]
-        command = groups[0]["params"] if model.dynamics.command is not None else []
-        for part in PRETRAINED:
-            parameters = [p for p in getattr(model, part).parameters() if p.requires_grad and part != "policy_head"]
-            parameters = [p for p in parameters if all(p is not c for c in command)]
-            if parameters:
-                share = self.encoder_lr_share if part == "encoder" else 1.0
-                groups.append({"params": parameters, "lr": lr * share})
-        self.model_parameters = [p for group in groups for p in group["params"]]
-        self.model_optimizer = torch.optim.Adam(groups, fused=True)
-        self.policy_optimizer = torch.optim.Adam(model.policy_head.parameters(), lr=policy_lr, eps=1e-5, fused=True)
-        self.entropy_optimizer = torch.optim.Adam([self.log_entropy_coef], lr=self.entropy_lr, fused=True)
-        self._prepare_for_graphs()
-
-    def _prepare_for_graphs(self) -> None:
-        """After the optimisers have moved: what they read in a recorded update lies on the device."""
-        recorded = self._graphs is not None and self.pretraining
         if self._graphs is not None:
             self._graphs.clear()
-        for optimizer in self._optimizers().values():
-            for group in optimizer.param_groups:
-                rate = float(group["lr"])
-                group["lr"] = torch.tensor(rate, device=self.device) if recorded else rate
-                group["capturable"] = recorded
-
-    def _optimizers(self) -> dict[str, torch.optim.Adam]:
-        return {"model": self.model_optimizer, "policy": self.policy_optimizer, "entropy": self.entropy_optimizer}
+        self.optimizers = Optimizers(
+            self.model,
+            self.log_entropy_coef,
+            lr=lr,
+            encoder_lr_share=self.encoder_lr_share,
+            policy_lr=policy_lr,
+            entropy_lr=self.entropy_lr,
+            command_lr=command_lr,
+            observation_lr=observation_lr,
+            recorded=self._graphs is not None and self.pretraining,
+        )
 
     @contextmanager
     def _constant_but_policy(self) -> Iterator[None]:

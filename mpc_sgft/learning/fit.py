@@ -81,13 +81,13 @@ def fit_dynamics(
         metrics["map_loss"] = error(maps.simulated, seen)
         of_maps = with_penalties(metrics["map_loss"], maps.penalties)
     check_finite(metrics)
-    agent.model_optimizer.zero_grad()
+    agent.optimizers.model.zero_grad()
     scale = agent.weights["consistency_loss"]
     (scale * total).backward(inputs=agent.dynamics_parameters() if maps else None)
     if maps is not None:
         (scale * of_maps).backward(inputs=[p for part in maps.parts for p in part.parameters()])
-    metrics["grad_norm"] = torch.nn.utils.clip_grad_norm_(agent.model_parameters, agent.grad_clip, foreach=True)
-    agent.model_optimizer.step()
+    metrics["grad_norm"] = torch.nn.utils.clip_grad_norm_(agent.optimizers.trained, agent.grad_clip, foreach=True)
+    agent.optimizers.model.step()
     return metrics, encoded
 
 
@@ -118,8 +118,6 @@ def fit_model(agent: Agent, data: Slices, *, rho: float) -> tuple[dict[str, Tens
         "reward_loss": losses.over_time(reward, rho),
     }
     check_finite(metrics)
-    agent.model_optimizer.zero_grad()
-    torch.stack([agent.weights[name] * loss for name, loss in metrics.items()]).sum().backward()
-    metrics["grad_norm"] = torch.nn.utils.clip_grad_norm_(agent.model_parameters, agent.grad_clip, foreach=True)
-    agent.model_optimizer.step()
+    total = torch.stack([agent.weights[name] * loss for name, loss in metrics.items()]).sum()
+    metrics["grad_norm"] = agent.step_model(total)
     return metrics, encoded.detach()

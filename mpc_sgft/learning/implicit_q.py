@@ -63,10 +63,7 @@ def fit_implicit(agent: Agent, found: Transitions, *, expectile: float, temperat
     }
     check_finite(metrics)
     trained = [*model.value_head.parameters(), *model.q_ensemble.parameters()]
-    agent.model_optimizer.zero_grad()
-    (metrics["value_loss"] + metrics["q_loss"]).backward(inputs=trained)
-    metrics["grad_norm"] = torch.nn.utils.clip_grad_norm_(trained, agent.grad_clip, foreach=True)
-    agent.model_optimizer.step()
+    metrics["grad_norm"] = agent.step_model(metrics["value_loss"] + metrics["q_loss"], trained)
     advantage = worth - value.detach()
     weight = (advantage / temperature).exp().clamp_max(HEAVIEST)
     log_prob = model.log_prob(found.z, found.action)

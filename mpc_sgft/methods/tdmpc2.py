@@ -3,9 +3,10 @@
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from mpc_sgft.learning.agent import PRETRAINED, Agent
+from mpc_sgft.learning.agent import Agent
 from mpc_sgft.learning.method import AbstractMethod, Gate
 from mpc_sgft.learning.observation_map import Sensed
+from mpc_sgft.learning.optimizers import PRETRAINED
 from mpc_sgft.learning.world_model import TERMINALS
 
 

@@ -51,7 +51,7 @@ def test_an_update_computes_no_slope_that_nobody_asks_for(imagined_steps):
         with FlopCounterMode(display=False) as counted:
             agent.update(make_batch())
         counts.append(counted.get_total_flops())
-        assert all(p.requires_grad for p in agent.model_parameters)
+        assert all(p.requires_grad for p in agent.optimizers.trained)
     assert counts[0] == counts[1]
 
 
@@ -87,7 +87,7 @@ def test_truncated_steps_bootstrap_like_any_other():
 
 def test_a_policy_update_leaves_no_gradient_in_the_critics():
     agent = make_agent()
-    agent.model_optimizer.zero_grad()
+    agent.optimizers.model.zero_grad()
     agent._update_policy(agent.model.encode(torch.randn(2, 5, 6)).detach(), read=True)
     assert all(p.grad is None for p in agent.model.q_ensemble.parameters())
 
@@ -281,7 +281,7 @@ def test_with_imagined_steps_the_policy_does_not_climb_the_critics(steps):
             p.normal_()
     for agent in (plain, other):
         agent.hold_value(True)  # the critics' gradients reach the dynamics after this update only
-        agent.model_optimizer.step = lambda: None
+        agent.optimizers.model.step = lambda: None
         agent.update(make_batch())
     same = all(
         torch.equal(a, b) for a, b in zip(*(x.model.policy_head.parameters() for x in (plain, other)), strict=True)
