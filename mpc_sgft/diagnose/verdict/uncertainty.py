@@ -11,7 +11,7 @@ from the parameters without prior knowledge of it, Brynjarsdottir and O'Hagan 20
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import stats
@@ -29,6 +29,29 @@ STEP = 0.02  # in typical sizes, of the parameter that moves most, to see how pr
 Interval = tuple[Array, Array]  # low and high of each parameter of one effect
 
 
+class Flat(NamedTuple):
+    """The parameters of all terms of a fit in one row, [P]."""
+
+    values: Array
+    sizes: Array  # typical ones
+    low: Array
+    high: Array
+    ends: list[int]  # where the next term begins
+
+    @classmethod
+    def of(cls, f: Fit) -> Flat:
+        sizes, low, high = (np.concatenate([getattr(t, name) for t in f.terms]) for name in ("size", "low", "high"))
+        return cls(np.concatenate(f.values), sizes, low, high, np.cumsum([len(t.size) for t in f.terms])[:-1].tolist())
+
+    def moved(self, by: Array) -> Array:
+        """The values, moved as far as bounds allow."""
+        return np.clip(self.values + by, self.low, self.high)
+
+    def by_term(self, x: Array) -> list[Array]:
+        """A row, term by term."""
+        return np.split(x, self.ends)
+
+
 def standard_deviations(e: Hypothesis) -> list[Array]:
     """Standard deviations of each term's parameters: the wider of the model's and the windows' own scatter.
 
@@ -41,7 +64,8 @@ def standard_deviations(e: Hypothesis) -> list[Array]:
     white = np.diag(inverse) * max(1.0, float(f.weights @ (f.r**2).mean(1) / f.weights.sum()))
     scores = np.einsum("w,wmp,wm->wp", f.weights, f.J, f.r, optimize=True)
     windows = np.diag(inverse @ (scores.T @ scores) @ inverse)
-    return _by_term(f, WIDER * np.sqrt(np.maximum(white, windows)))
+    flat = Flat.of(f)
+    return flat.by_term(flat.sizes * WIDER * np.sqrt(np.maximum(white, windows)))
 
 
 def intervals(e: Hypothesis, level: float = 0.90) -> list[Interval]:
@@ -62,32 +86,29 @@ def compared(setup: Setup[Any], e: Hypothesis, level: float = 0.90) -> list[Inte
     if not e.effects:
         return []
     f, everything = e.fit, np.concatenate([setup.fitted, setup.held])
-    inverse = _covariance(f)
-    sizes = np.concatenate([t.size for t in f.terms])
-    low, high = (np.concatenate([getattr(t, end) for t in f.terms]) for end in ("low", "high"))
-    here, ends = np.concatenate(f.values), np.cumsum([len(t.size) for t in f.terms])[:-1]
+    inverse, flat = _covariance(f), Flat.of(f)
 
     def errors(points: list[Array]) -> Array:
-        r = setup.problem.residuals(f.terms, [np.split(x, ends) for x in points], everything)
+        r = setup.problem.residuals(f.terms, [flat.by_term(x) for x in points], everything)
         return setup.judged((r**2).mean(-1))
 
-    best = errors([here])[0]
+    best = errors([flat.values])[0]
     enough = WIDER * float(stats.t.ppf(0.5 + level / 2, len(best) - 1)) / np.sqrt(len(best))
 
     def worse_from(i: int, way: Array) -> float:
         """Where the i-th parameter is when errors have risen."""
         for some in LADDER.reshape(-1, RUNGS):
-            tries = [np.clip(here + k * way, low, high) for k in some]
+            tries = [flat.moved(k * way) for k in some]
             rise = errors(tries) - best  # [K, W]
             risen = np.flatnonzero(rise.mean(-1) > enough * rise.std(-1, ddof=1))
             if len(risen):
                 return float(tries[risen[0]][i])
-        return float((low, high)[int(way[i] > 0)][i])
+        return float((flat.low, flat.high)[int(way[i] > 0)][i])
 
     sd = np.concatenate(standard_deviations(e))
-    ways = inverse / np.diag(inverse) * sizes[:, None] / sizes * sd  # column i: of all, for one sd of the i-th
+    ways = inverse / np.diag(inverse) * flat.sizes[:, None] / flat.sizes * sd  # column i: for one sd of the i-th
     reach = np.array([[worse_from(i, sign * way) for i, way in enumerate(ways.T)] for sign in (-1, 1)])
-    return [*zip(*(np.split(r, ends)[len(f.terms) - e.effects :] for r in reach), strict=True)]
+    return [*zip(*(flat.by_term(r)[len(f.terms) - e.effects :] for r in reach), strict=True)]
 
 
 def sure_intervals(setup: Setup[Any], e: Hypothesis, tolerance: Tolerance, told: Array) -> list[Interval]:
@@ -102,7 +123,8 @@ def sure_intervals(setup: Setup[Any], e: Hypothesis, tolerance: Tolerance, told:
     statistical = compared(setup, e) if setup.problem.pattern else intervals(e)
     if not (tolerance.asked and e.effects):
         return statistical
-    reach = _by_term(e.fit, indistinct(e.fit, tolerance, told))[len(e.fit.terms) - e.effects :]
+    flat = Flat.of(e.fit)
+    reach = flat.by_term(flat.sizes * indistinct(e.fit, tolerance, told))[len(e.fit.terms) - e.effects :]
     rows = zip(e.terms, e.values, statistical, reach, strict=True)
     return [
         (np.maximum(v - np.hypot(v - low, r), t.low), np.minimum(v + np.hypot(high - v, r), t.high))
@@ -116,16 +138,14 @@ def indistinct(f: Fit, tolerance: Tolerance, told: Array) -> Array:
     The other parameters go along so that the predictions differ least: along a column of the inverse of J'J. To first
     order, from one step of each.
     """
-    inverse = _covariance(f)
-    sizes = np.concatenate([t.size for t in f.terms])
+    inverse, flat = _covariance(f), Flat.of(f)
     ways = inverse / np.abs(inverse).max(0)  # column i: the move of all for one of the i-th
-    low, high = (np.concatenate([getattr(t, end) for t in f.terms]) for end in ("low", "high"))
-    here, moved, went = np.concatenate(f.values), [], []
+    moved, went = [], []
     for i, way in enumerate(ways.T):
-        ahead, back = (np.clip(here + sign * STEP * way * sizes, low, high) for sign in (1, -1))
-        there = max((ahead, back), key=lambda x, i=i: abs(x[i] - here[i]))  # away from a bound
-        moved.append(f._replace(values=tuple(np.split(there, np.cumsum([len(t.size) for t in f.terms])[:-1]))))
-        went.append(abs(there[i] - here[i]) / sizes[i])
+        ahead, back = (flat.moved(sign * STEP * way * flat.sizes) for sign in (1, -1))
+        there = max((ahead, back), key=lambda x, i=i: abs(x[i] - flat.values[i]))  # away from a bound
+        moved.append(f._replace(values=tuple(flat.by_term(there))))
+        went.append(abs(there[i] - flat.values[i]) / flat.sizes[i])
     return np.array(went) / np.maximum(tolerance.shares([f, *moved], told), 1e-12)
 
 
@@ -133,9 +153,3 @@ def _covariance(f: Fit) -> Array:
     """Inverse of J'J, of windows as they were weighed, in typical sizes."""
     A = np.einsum("w,wmp,wmq->pq", f.weights, f.J, f.J, optimize=True)
     return np.linalg.pinv(A + 1e-12 * np.eye(len(A)) * max(float(np.trace(A)), 1e-30))
-
-
-def _by_term(f: Fit, x: Array) -> list[Array]:
-    """Numbers of all parameters in typical sizes -> in their own units, term by term."""
-    ends = np.cumsum([len(t.size) for t in f.terms])
-    return [part * t.size for part, t in zip(np.split(x, ends[:-1]), f.terms, strict=True)]
