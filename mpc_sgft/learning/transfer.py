@@ -72,20 +72,16 @@ class Transfer:
         agent.model.sizes["terminal"] = method.terminal  # whatever the checkpoint was last used with
         self.simulated = None
         sizes = {"slice_len": method.slice_len, "batch_size": batch_size, "seed": seed, "device": agent.device}
-        if method.simulated_episodes:
-            if simulated is None:
-                raise ValueError(f"{type(method).__name__} learns from simulated episodes: give what makes them.")
+        compares = method.gate is not None and method.gate.excess > 0
+        if simulated is None and (method.simulated_episodes or compares):
+            raise ValueError(f"{type(method).__name__} needs simulated episodes here: give what makes them.")
+        if simulated and method.simulated_episodes:
             steps = simulated(method.simulated_episodes)  # before the method changes anything
             sizes["batch_size"] = batch_size // 2
             self.simulated = make_buffer(steps.numel(), **sizes)
             self.simulated.extend(steps)
-        self.simulated_error = 0.0  # geometric mean of the pretrained dynamics' error over simulated episodes
-        if method.gate and method.gate.excess:
-            if simulated is None:
-                raise ValueError(
-                    f"gate_excess={method.gate.excess} compares with simulation: give what makes episodes."
-                )
-            self.simulated_error = mean_error(agent.model, simulated(SIMULATED), method.slice_len)
+        self._simulate = simulated
+        self.simulated_error: float | None = None  # of the pretrained dynamics over simulated episodes, once asked for
         method.take_over(agent, sensed)
         self._new_buffer = partial(make_buffer, capacity, **sizes)
         self.buffer = self._new_buffer()
@@ -103,6 +99,8 @@ class Transfer:
 
         gate, mapped = self.method.gate, None
         if gate and gate.excess:
+            if self.simulated_error is None and self._simulate:  # so at the first rollout: nothing has trained yet
+                self.simulated_error = mean_error(self.pretrained, self._simulate(SIMULATED), self.slice_len)
             simulator = copy.deepcopy(self.averaged.model)
             self._simulate_beneath(simulator)
             mapped = error(simulator)
@@ -110,7 +108,8 @@ class Transfer:
         recent = self.verdicts[1:][-gate.memory :] if gate else []  # at the first rollout all are still the same
         if gate and recent:
             errors = [v.mapped for v in recent if v.mapped is not None]
-            beneath = not errors or statistics.geometric_mean(errors) > gate.excess * self.simulated_error
+            limit = gate.excess * (self.simulated_error or 0.0)
+            beneath = not errors or statistics.geometric_mean(errors) > limit
             accepted = clearly_better(recent, gate.margin)
             self.verdicts[-1] = self.verdicts[-1]._replace(accepted=accepted, beneath=beneath)
         return self.verdicts[-1]
@@ -165,6 +164,7 @@ class Transfer:
             "acting": self.acting.state_dict(),
             "starts": [x.clone() for x in self.starts],
             "verdicts": [tuple(v) for v in self.verdicts],
+            "simulated_error": self.simulated_error,
         }
 
     def load_state_dict(self, state: dict) -> None:
@@ -178,6 +178,7 @@ class Transfer:
         self.acting.load_state_dict(state["acting"])
         self.starts = [x.to(self.agent.device) for x in state["starts"]]
         self.verdicts = [Verdict(*v) for v in state["verdicts"]]
+        self.simulated_error = state["simulated_error"]
 
 
 def clearly_better(verdicts: list[Verdict], margin: float) -> bool:

@@ -49,7 +49,7 @@ class SGFT(AbstractMethod):
         updates, slice_len, action_noise, average_decay, policy_share: As in `AbstractMethod`.
 
     Raises:
-        ValueError: If the horizon is not positive, rho lies outside (0, 1], or gate_excess is negative or has no gate.
+        ValueError: If the horizon is not positive, rho lies outside (0, 1], or gate_excess is negative.
 
     Source: Yin, Westenbroek et al., ICLR 2025.
     """
@@ -82,8 +82,8 @@ class SGFT(AbstractMethod):
         action_noise: float,
     ):
         check_objective(horizon, rho)
-        if gate_excess < 0 or gate_excess and not gate:
-            raise ValueError(f"gate_excess={gate_excess} must be 0 or more, and 0 with gate=false.")
+        if gate_excess < 0:
+            raise ValueError(f"gate_excess={gate_excess} must be 0 or more.")
         self.horizon, self.lr, self.policy_lr, self.command_lr = horizon, lr, policy_lr, command_lr
         self.entropy_coef, self.rho, self.anchor = entropy_coef, rho, anchor
         self.residual, self.command_map, self.command_sparsity = residual, command_map, command_sparsity

@@ -28,6 +28,7 @@ def make_agent(sizes: dict | None = None, **changes) -> Agent:
 def make_sgft(**changes) -> SGFT:
     plain = {
         "horizon": 2,
+        "gate_excess": 0.0,
         "anchor": 0.0,
         "command_map": False,
         "observation_map": False,
@@ -115,7 +116,9 @@ def test_the_dynamics_beneath_the_maps_stay_where_simulation_is_predicted_as_bad
         asked.append(episodes)
         return simulated
 
-    t = Transfer(agent, make_sgft(**numbers), SENSED, capacity=200, batch_size=16, seed=0, simulated=simulate)
+    sizes = {"capacity": 200, "batch_size": 16, "seed": 0, "simulated": simulate}
+    t = Transfer(agent, make_sgft(**numbers), SENSED, **sizes)
+    assert not asked  # the first rollout need not wait for it
     for _ in range(2):
         t.learn(simulated[0])
     verdict, acting, learned = t.verdicts[-1], t.acting.dynamics, t.averaged.model.dynamics
@@ -126,16 +129,20 @@ def test_the_dynamics_beneath_the_maps_stay_where_simulation_is_predicted_as_bad
     wanted = learned.base if beneath else t.pretrained.dynamics.base
     assert not torch.equal(learned.base[0].linear.weight, t.pretrained.dynamics.base[0].linear.weight)
     assert torch.equal(acting.base[0].linear.weight, wanted[0].linear.weight)
+    again = Transfer(make_agent(MEMORY), make_sgft(**numbers), SENSED, **sizes)
+    again.load_state_dict(t.state_dict())
+    again.learn(simulated[1])
+    assert asked == [32] and again.simulated_error == t.simulated_error
 
 
-@pytest.mark.parametrize("numbers", [{"gate_excess": -1.0}, {"gate_excess": 2.0, "gate": False}])
-def test_an_excess_that_would_do_nothing_is_refused(numbers: dict):
-    with pytest.raises(ValueError, match="must be 0 or more, and 0 with gate=false"):
-        make_sgft(**numbers)
+def test_a_negative_excess_is_refused_and_without_a_gate_there_is_none():
+    with pytest.raises(ValueError, match="gate_excess=-1.0 must be 0 or more"):
+        make_sgft(gate_excess=-1.0)
+    assert make_sgft(gate_excess=2.0, gate=False).gate is None
 
 
 def test_a_comparison_with_simulation_needs_simulated_episodes():
-    with pytest.raises(ValueError, match="give what makes episodes"):
+    with pytest.raises(ValueError, match="SGFT needs simulated episodes here"):
         transfer(of_method={"gate_excess": 2.0})
 
 

@@ -113,7 +113,8 @@ def test_plans_end_in_what_the_method_says_whatever_the_checkpoint_was_last_used
     t = make("method=tdmpc2", "method.terminal=q")
     assert {x.sizes["terminal"] for x in (t.agent.model, t.acting, t.pretrained)} == {"q"}
     sensed = Sensed(("tip_x", "tip_y"), torch.zeros(2, 2))
-    again = Transfer(t.agent, make("method=sgft").method, sensed, capacity=100, batch_size=4, seed=0)
+    sizes = {"capacity": 100, "batch_size": 4, "seed": 0}
+    again = Transfer(t.agent, make("method=sgft").method, sensed, simulated=simulated, **sizes)
     assert again.acting.sizes["terminal"] == "value"
 
 
