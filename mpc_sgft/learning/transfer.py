@@ -97,10 +97,9 @@ class Transfer:
         def error(model: WorldModel) -> float:
             return float(open_loop_error(model, steps, self.slice_len).nanmean())
 
-        gate, mapped = self.method.gate, None
+        gate, mapped, limit = self.method.gate, None, 0.0
         if gate and gate.excess:
-            if self.simulated_error is None and self._simulate:  # so at the first rollout: nothing has trained yet
-                self.simulated_error = mean_error(self.pretrained, self._simulate(SIMULATED), self.slice_len)
+            limit = gate.excess * self._error_in_simulation()
             simulator = copy.deepcopy(self.averaged.model)
             self._simulate_beneath(simulator)
             mapped = error(simulator)
@@ -108,11 +107,17 @@ class Transfer:
         recent = self.verdicts[1:][-gate.memory :] if gate else []  # at the first rollout all are still the same
         if gate and recent:
             errors = [v.mapped for v in recent if v.mapped is not None]
-            limit = gate.excess * (self.simulated_error or 0.0)
             beneath = not errors or statistics.geometric_mean(errors) > limit
             accepted = clearly_better(recent, gate.margin)
             self.verdicts[-1] = self.verdicts[-1]._replace(accepted=accepted, beneath=beneath)
         return self.verdicts[-1]
+
+    def _error_in_simulation(self) -> float:
+        """Of the pretrained dynamics; asked for at the first rollout, when nothing has trained yet."""
+        if self.simulated_error is None:
+            assert self._simulate is not None  # a gate that compares is refused without
+            self.simulated_error = mean_error(self.pretrained, self._simulate(SIMULATED), self.slice_len)
+        return self.simulated_error
 
     def learn(self, steps: TensorDict, track: Callable[[range], Iterable[int]] = iter) -> dict[str, float]:
         """Judge a rollout [T], learn from all there are, and hand over the parts that may act; returns metrics.
