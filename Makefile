@@ -23,12 +23,13 @@ help: ## List the targets.
 setup: $(STAMP) ## Create .venv and install everything (once).
 
 # uv is several times faster than pip with wheels of this size; it is told about pip's own index settings, if there are any.
+# Unlike pip it leaves compiling to the first import, or to every one where PYTHONDONTWRITEBYTECODE is set: half of a start.
 $(STAMP): requirements.lock pyproject.toml
 	@$(PYTHON) -c 'import sys; v = sys.version_info; sys.exit(None if v >= (3, 11) else f"error: Python 3.11 or newer is needed, {v[0]}.{v[1]} found; say which: make setup PYTHON=python3.11")'
 	@[ -x $(BIN)/python ] || { echo "creating .venv"; $(PYTHON) -m venv .venv; }
 	@echo "installing $$(wc -l < requirements.lock) packages into .venv (a few GB, once)"
 	@$(BIN)/python -m pip install -q uv
-	@UV_HTTP_TIMEOUT=300 $${PIP_INDEX_URL:+env UV_DEFAULT_INDEX="$$PIP_INDEX_URL"} $(BIN)/uv pip install -q --python $(BIN)/python -r requirements.lock \
+	@UV_HTTP_TIMEOUT=300 $${PIP_INDEX_URL:+env UV_DEFAULT_INDEX="$$PIP_INDEX_URL"} $(BIN)/uv pip install -q --compile-bytecode --python $(BIN)/python -r requirements.lock \
 	  || { echo "uv could not install; trying pip, which takes longer"; $(BIN)/python -m pip install -q -r requirements.lock; }
 	@$(BIN)/python -m pip install -q --no-deps --no-build-isolation -e .
 	@touch $(STAMP)

@@ -4,11 +4,12 @@
 
 `plan`: one thread; each row changes one number of the first one, and `ratio` is to that one, measured beside it.
 `start`: seconds until a command has said `--help`, until the libraries under every command are imported, and until a
-deployment has recorded its first rollout.
+deployment has recorded its first rollout; that once more without Python's compiled files, beside it.
 `disk`: bytes that ten more rollouts of push add to run.rrd and to the episodes, a rollout.
 """
 
 import argparse
+import os
 import subprocess
 import sys
 import tempfile
@@ -68,7 +69,7 @@ def plans(repeats: int) -> list[dict[str, object]]:
 
 
 def starts(repeats: int) -> list[dict[str, object]]:
-    """Seconds of `--help` of each command, and of a deployment of one rollout until it is on disk."""
+    """Seconds of `--help` of each command, of imports, and of a deployment until its first rollout is on disk."""
     rows = []
     lines = {f"{name} --help": ["-m", f"mpc_sgft.{name}", "--help"] for name in COMMANDS}
     lines |= {f"import {name}": ["-c", f"import {name}"] for name in LIBRARIES}
@@ -79,23 +80,32 @@ def starts(repeats: int) -> list[dict[str, object]]:
             subprocess.run([sys.executable, *words], check=True, stdout=subprocess.DEVNULL)
             took.append(time.perf_counter() - start)
         rows.append(_row("start", what, "", median(took), "s"))
-    took = []
+    compiled, not_compiled = [], []
     for _ in range(repeats):
-        with tempfile.TemporaryDirectory() as folder:
-            first = Path(folder) / "run" / "episodes" / "0001.mcap"
-            words = ["rollouts=1", "eval_episodes=1", "quiet=true", f"run_dir={folder}/run"]
-            start = time.perf_counter()
-            with subprocess.Popen(
-                [sys.executable, "-m", "mpc_sgft.deploy", *words], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
-            ) as process:
-                while not first.exists() and process.poll() is None:
-                    time.sleep(0.02)
-                took.append(time.perf_counter() - start)
-                said = process.stderr.read() if process.stderr else b""
-            if process.returncode:
-                raise RuntimeError(f"deploy ended with {process.returncode}: {said.decode()[-500:]}")
-    rows.append(_row("start", "deploy to the first rollout", "", median(took), "s"))
+        compiled.append(first_rollout())
+        not_compiled.append(first_rollout(PYTHONPYCACHEPREFIX="nowhere", PYTHONDONTWRITEBYTECODE="1"))
+    took = median(compiled)
+    rows.append(_row("start", "deploy to the first rollout", "", took, "s"))
+    rows.append(_row("start", "the same, nothing compiled", "", median(not_compiled), "s", median(not_compiled) / took))
     return rows
+
+
+def first_rollout(**environment: str) -> float:
+    """Seconds until a new deployment, with these environment variables, has recorded its first rollout."""
+    with tempfile.TemporaryDirectory() as folder:
+        first = Path(folder) / "run" / "episodes" / "0001.mcap"
+        words = ["rollouts=1", "eval_episodes=1", "quiet=true", f"run_dir={folder}/run"]
+        line, start = [sys.executable, "-m", "mpc_sgft.deploy", *words], time.perf_counter()
+        with subprocess.Popen(
+            line, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, env=os.environ | environment
+        ) as process:
+            while not first.exists() and process.poll() is None:
+                time.sleep(0.02)
+            took = time.perf_counter() - start
+            said = process.stderr.read() if process.stderr else b""
+        if process.returncode:
+            raise RuntimeError(f"deploy ended with {process.returncode}: {said.decode()[-500:]}")
+    return took
 
 
 def disk() -> list[dict[str, object]]:
