@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
-from scipy.stats import beta
+from scipy.special import betaincinv
 from torch import Tensor
 
 import mpc_sgft
@@ -105,7 +105,7 @@ def make_curriculum(cfg: DictConfig) -> "Doraemon | None":
 
 def drawn_ranges(cfg: DictConfig, shapes: Tensor) -> dict[str, list[float]]:
     """Of each draw, where 90 % of what the Beta distributions [D, 2] draw lies, {name: [from, to]}, its own unit."""
-    ends = beta.ppf([[0.05], [0.95]], *shapes.T.numpy()).T  # [D, 2]
+    ends = betaincinv(*shapes.T.numpy(), [[0.05], [0.95]]).T  # [D, 2]
     return {
         name: [round(draw.value(float(x)), 4) for x in places]
         for (name, draw), places in zip(draws_of(cfg).items(), ends, strict=True)

@@ -5,13 +5,13 @@ from typing import NamedTuple, cast
 
 import numpy as np
 import torch
-from scipy.stats import binomtest
 from tensordict import TensorDict
 from torch import Tensor
 from tqdm import tqdm
 
 from envs.env import ControlEnv
 from mpc_sgft.learning.world_model import WorldModel
+from mpc_sgft.runs.proportion import wilson
 from planners.base import Plan
 
 Act = Callable[[Tensor, Tensor], Tensor]  # observation [N, O], fresh [N] -> action [N, A]
@@ -85,8 +85,7 @@ def succeeded(episodes: TensorDict) -> Tensor:
 def score_of(successes: Sequence[bool], returns: Sequence[float]) -> Score:
     """The score of episodes of which only the outcome is known; at least one."""
     n, k = len(successes), sum(successes)
-    interval = binomtest(k, n).proportion_ci(method="wilson")
-    return Score(n, k, k / n, float(interval.low), float(interval.high), float(np.mean(returns)))
+    return Score(n, k, k / n, *wilson(k, n), float(np.mean(returns)))
 
 
 def planner_policy(model: WorldModel, planner, seed: int, *, explore: bool = False) -> Act:

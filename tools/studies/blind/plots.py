@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from tools.studies.blind.score import named, top1, wilson
+from mpc_sgft.runs.proportion import wilson
+from tools.studies.blind.score import named, top1
 
 EDGES = (0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0, 10.5)  # multiples of the detectable size
 NOT_NAMES = ("none", "unknown", "not_identifiable", "error")

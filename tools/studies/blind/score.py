@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple
 
-import numpy as np
+from mpc_sgft.runs.proportion import wilson
 
 Report = Mapping[str, Any]
 Label = Mapping[str, Any]
@@ -24,16 +24,6 @@ class Score(NamedTuple):
     @property
     def value(self) -> float:
         return self.hits / self.count if self.count else float("nan")
-
-
-def wilson(hits: float, count: int, z: float = 1.959964) -> tuple[float, float]:
-    """95 % interval of a share (E. B. Wilson, 1927); (nan, nan) without data."""
-    if count == 0:
-        return float("nan"), float("nan")
-    share = hits / count
-    centre = (share + z * z / (2 * count)) / (1 + z * z / count)
-    half = z / (1 + z * z / count) * np.sqrt(share * (1 - share) / count + z * z / (4 * count**2))
-    return float(max(0.0, centre - half)), float(min(1.0, centre + half))
 
 
 def named(report: Report) -> list[str]:
