@@ -1,7 +1,8 @@
 """Domain randomisation: each episode draws its own model, field by field."""
 
+import copy
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -46,6 +47,11 @@ class Draw:
             return float(np.exp(np.log(self.low) + (np.log(self.high) - np.log(self.low)) * place))
         return self.low + (self.high - self.low) * place
 
+    def write(self, field: NDArray, rows: list[int], column: int | None, value: float) -> None:
+        """Change the rows of a model's field, or one column of them, by the number drawn."""
+        where = (rows, column) if column is not None else rows
+        field[where] = OPERATIONS[self.operation](field[where], value)
+
 
 def load(draws: Mapping[str, Mapping[str, Any]]) -> list[Draw]:
     """Build draws from configs/randomize/*.yaml, {name: {fields, at, operation, low, high, distribution}}.
@@ -65,6 +71,21 @@ def load(draws: Mapping[str, Mapping[str, Any]]) -> list[Draw]:
                 f"randomize draw {name!r}: {error}. It has: {', '.join(f.name for f in fields(Draw))}."
             ) from error
     return built
+
+
+def changed(model: mujoco.MjModel, draws: Sequence[Draw], values: Sequence[float]) -> mujoco.MjModel:
+    """A copy of a model into which each draw has written its value.
+
+    Raises:
+        ValueError: For a field or a name that the model lacks.
+    """
+    made = copy.copy(model)
+    for draw, value in zip(draws, values, strict=True):
+        for field in draw.fields:
+            name, rows, column = _locate(made, field, draw.at)
+            draw.write(getattr(made, name), rows, column, value)
+    mujoco.mj_setConst(made, mujoco.MjData(made))
+    return made
 
 
 class Randomizer:
@@ -105,8 +126,7 @@ class Randomizer:
             field[...] = self.nominal[name]
         for draw, targets, value in zip(self.draws, self.targets, values, strict=True):
             for name, rows, column in targets:
-                where = (rows, column) if column is not None else rows
-                model[name][where] = OPERATIONS[draw.operation](model[name][where], value)
+                draw.write(model[name], rows, column, value)
 
     def _check_delays(self, model: mujoco.MjModel) -> None:
         """MuJoCo silently clips a delay that is longer than the command history."""

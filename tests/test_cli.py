@@ -225,6 +225,19 @@ def test_a_gap_may_be_a_file(loops: Path, capsys) -> None:
     assert capsys.readouterr().out == "0 none+actuator_gain={gain:0.6} 4\n"
 
 
+def test_a_randomisation_may_be_a_file(loops: Path) -> None:
+    """It replaces the task's own, what is drawn and what is not."""
+    draws = {"mass": {"fields": ["body_mass"], "at": ["puck"], "low": 0.9, "high": 1e2, "distribution": "loguniform"}}
+    Path("found.yaml").write_text(yaml.safe_dump({"noise_sd": 0.002, "draws": draws}))
+    given = compose.spread(["randomize=found.yaml"])
+    cfg = compose.compose("pretrain", [compose.normalise(text) for text in given], given)
+    assert OmegaConf.to_container(cfg.randomize) == {"noise_sd": 0.002, "noise_probability": 0.0, "draws": draws}
+    for text, words in (("noise_sd: 1", "it needs one key, `draws:`"), (None, "or a name: .*push_wide")):
+        Path("found.yaml").unlink() if text is None else Path("found.yaml").write_text(text)
+        with pytest.raises(UserError, match=words):
+            compose.spread(["randomize=found.yaml"])
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [

@@ -30,21 +30,22 @@ RENAMED = {  # beginnings of overrides that had another name
     "train.agent.residual": "method.residual",
     "train.agent.command_": "method.command_",
 }
+FILES = {"gap": "effects", "randomize": "draws"}  # groups that a file may stand for, and the mapping that it must hold
 OPEN = ("gap.effects.", "randomize.")  # mappings that may gain keys on the command line
 FORM = re.compile(r"(?P<sign>\+\+|\+|~)?(?P<key>[A-Za-z_][\w./@-]*)(?P<rest>=.*)?", re.DOTALL)
 
 
 def spread(given: Sequence[str]) -> list[str]:
-    """The same overrides, with the effects themselves in place of `gap=FILE.yaml`, such as diagnose's effects.yaml.
+    """The same overrides, with what they hold in place of `gap=FILE.yaml` and `randomize=FILE.yaml`.
 
     Raises:
-        UserError: If the file is absent or holds no effects.
+        UserError: If the file is absent or does not hold effects, or draws.
     """
     out: list[str] = []
     for text in given:
         key, _, value = text.lstrip("+").partition("=")
-        if key == "gap" and value.endswith(".yaml"):
-            out += ["gap=none", *(f"gap.effects.{name}={_literal(what)}" for name, what in _gap_file(value).items())]
+        if key in FILES and value.endswith(".yaml"):
+            out += [f"{key}=none", *(f"{key}.{name}={_literal(what)}" for name, what in _contents(key, value))]
         else:
             out.append(text)
     return out
@@ -253,20 +254,22 @@ def _compose(name: str, overrides: Sequence[str]) -> DictConfig:
         raise UserError(first_line(err)) from err
 
 
-def _gap_file(path: str) -> dict[str, Any]:
+def _contents(group: str, path: str) -> list[tuple[str, Any]]:
+    """Names below a group and their values, from a file of one's own."""
+    key = FILES[group]
     try:
         content = OmegaConf.to_container(OmegaConf.load(path))
     except FileNotFoundError as err:
-        gaps = ", ".join(choices.groups()["gap"])
-        raise UserError(f"gap={path}: no such file. Give one with `effects:`, or a name: {gaps}.") from err
+        names = ", ".join(choices.groups()[group])
+        raise UserError(f"{group}={path}: no such file. Give one with `{key}:`, or a name: {names}.") from err
     except (YAMLError, OmegaConfBaseException, OSError, UnicodeDecodeError) as err:
-        raise UserError(f"gap={path}: cannot be read: {first_line(err)}") from err
-    effects = content.get("effects") if isinstance(content, dict) else None
-    if not isinstance(effects, dict):
-        raise UserError(
-            f"gap={path}: it needs one key, `effects:`, with {{<effect>: {{<parameter>: <value>}}}} under it."
-        )
-    return {str(name): what for name, what in effects.items()}
+        raise UserError(f"{group}={path}: cannot be read: {first_line(err)}") from err
+    inner = content.pop(key, None) if isinstance(content, dict) else None
+    if not isinstance(content, dict) or not isinstance(inner, dict):
+        form = {"gap": "<effect>: {<parameter>: <value>}", "randomize": "<draw>: {fields: [...], low: .., high: ..}"}
+        raise UserError(f"{group}={path}: it needs one key, `{key}:`, with {{{form[group]}}} under it.")
+    beside = [] if group == "gap" else [(str(name), what) for name, what in content.items()]
+    return beside + [(f"{key}.{name}", what) for name, what in inner.items()]
 
 
 def _literal(value: Any) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import os
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -39,6 +40,12 @@ def parser() -> argparse.ArgumentParser:
     )
     p.add_argument(
         "--retrain-transitions", type=int, default=60_000, metavar="N", help="how long; default 60000, a few minutes"
+    )
+    p.add_argument(
+        "--ranges",
+        metavar="RANDOMIZE",
+        help="with --run: do not name effects, but find how widely pretraining should vary each draw of "
+        "configs/randomize/RANDOMIZE.yaml (DROPO)",
     )
     p.add_argument(
         "--map",
@@ -100,8 +107,9 @@ def _run(args: argparse.Namespace) -> int:
         return _inspect(args)
     if args.run is not None:
         return _run_folder(args)
-    if args.retrain:
-        raise UserError("--retrain needs --run, the deployment to learn from.")
+    for name in ("retrain", "ranges"):
+        if getattr(args, name):
+            raise UserError(f"--{name} needs --run, the deployment to learn from.")
     missing = [name for name in ("model", "data") if getattr(args, name) is None]
     if missing:
         raise UserError(f"--{missing[0]} is missing: give --model scene.xml and --data EPISODES...")
@@ -127,14 +135,18 @@ def _run(args: argparse.Namespace) -> int:
     return 0
 
 
+def _given(args: argparse.Namespace) -> set[str]:
+    """Names of the options that were given, and say something else than what is taken without."""
+    alone = vars(parser().parse_args([]))
+    return {name for name, value in vars(args).items() if value != alone[name]}
+
+
 def _inspect(args: argparse.Namespace) -> int:
     from mpc_sgft.command.errors import UserError
     from mpc_sgft.diagnose.inspect import inspect
     from mpc_sgft.diagnose.simulation.plant import load_plant
 
-    alone = parser().parse_args([])
-    given = [name for name in vars(alone) if getattr(args, name) != getattr(alone, name)]
-    if others := sorted({*given} - {"inspect", "model", "map"}):
+    if others := sorted(_given(args) - {"inspect", "model", "map"}):
         raise UserError(
             f"--{others[0].replace('_', '-')} does not go with --inspect, which only looks: --inspect RECORDINGS, with "
             "--model and --map if you like."
@@ -165,6 +177,8 @@ def _run_folder(args: argparse.Namespace) -> int:
         taken = [str(out / part) for part in ("pretrain", "deploy") if (out / part).exists()]
         if taken:
             raise UserError(f"{taken[0]} is there from an earlier --retrain. Move it away, or give another --out.")
+    if args.ranges is not None:
+        return _ranges(args, out)
     report = diagnose_run(
         args.run,
         out=out,
@@ -186,7 +200,35 @@ def _run_folder(args: argparse.Namespace) -> int:
             print("nothing to retrain on: nothing was found that brings simulation nearer to the recordings")
             return 0
         effects = yaml.safe_load((out / report.data["effects_file"]).read_text())["effects"]
-        print(table(retrain(args.run, effects, out, args.retrain_transitions)))
+        print(table(retrain(args.run, out, args.retrain_transitions, effects=effects)))
+    return 0
+
+
+def _ranges(args: argparse.Namespace, out: Path) -> int:
+    from mpc_sgft.command.errors import UserError
+    from mpc_sgft.diagnose.deployments.ranges import find_ranges, randomisation
+    from mpc_sgft.diagnose.deployments.recordings import read_deployment
+    from mpc_sgft.diagnose.deployments.retrain import retrain, table
+    from mpc_sgft.storage.metrics import progress
+
+    if others := sorted(_given(args) - {"run", "out", "ranges", "retrain", "retrain_transitions", "seed"}):
+        name = others[0].replace("_", "-")
+        raise UserError(f"--{name} does not go with --ranges, which names no effects; leave it out.")
+
+    def track(rounds: range) -> Iterator[int]:
+        with progress(len(rounds), desc="ranges", unit="round") as bar:
+            for number in rounds:
+                yield number
+                bar.update()
+
+    within = randomisation(args.run, args.ranges)
+    found = find_ranges(read_deployment(args.run), within, seed=args.seed, track=track)
+    out.mkdir(parents=True, exist_ok=True)
+    found.write(out / "ranges.yaml")
+    print(found.table())
+    print(f"from {found.windows} windows: {out / 'ranges.yaml'}, which pretrain takes as randomize=FILE")
+    if args.retrain:
+        print(table(retrain(args.run, out, args.retrain_transitions, randomize=found.randomize)))
     return 0
 
 

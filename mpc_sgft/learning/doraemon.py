@@ -1,18 +1,13 @@
 """Domain randomisation that widens by itself: as random as possible while the policy still succeeds (DORAEMON)."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
-import numpy as np
 import torch
-from scipy.optimize import minimize
 from torch import Tensor
-from torch.distributions import Beta, kl_divergence
+from torch.distributions import kl_divergence
 
-EDGE = 1e-6  # of a place in a range, 0 to 1: a Beta density may be infinite at the ends
-MOST = 1000.0  # largest parameter of a Beta distribution
-
-Function = Callable[[Tensor], Tensor]
+from mpc_sgft.learning.beta import EDGE, MOST, beta, climb
 
 
 class Doraemon:
@@ -56,7 +51,7 @@ class Doraemon:
     @property
     def entropy(self) -> float:
         """Of all draws together, nats; 0 is uniform, below is narrower."""
-        return float(_beta(self.shapes.log()).entropy().sum())
+        return float(beta(self.shapes.log()).entropy().sum())
 
     def record(self, places: Tensor, success: Tensor, shapes: Sequence[Sequence[float]]) -> dict[str, float]:
         """Take in a round of episodes, and widen or narrow once there are enough; returns metrics.
@@ -68,7 +63,7 @@ class Doraemon:
         """
         told = places.isfinite().all(1)
         places = places[told].double().clamp(EDGE, 1 - EDGE)
-        drawn_from = _beta(torch.tensor(shapes, dtype=torch.float64).log())
+        drawn_from = beta(torch.tensor(shapes, dtype=torch.float64).log())
         self._seen.append((places, success[told].double(), drawn_from.log_prob(places).sum(1)))
         if sum(len(part[0]) for part in self._seen) >= self.episodes:
             self._change(*(torch.cat(column) for column in zip(*self._seen, strict=True)))
@@ -77,21 +72,21 @@ class Doraemon:
 
     def _change(self, places: Tensor, success: Tensor, log_density: Tensor) -> None:
         here = self.shapes.log()
-        old = _beta(here)
+        old = beta(here)
 
         def succeeds(x: Tensor) -> Tensor:
-            return ((_beta(x).log_prob(places).sum(1) - log_density).exp() * success).mean() - self.success
+            return ((beta(x).log_prob(places).sum(1) - log_density).exp() * success).mean() - self.success
 
         def near(x: Tensor) -> Tensor:
-            return self.trust - kl_divergence(_beta(x), old).sum()
+            return self.trust - kl_divergence(beta(x), old).sum()
 
         def entropy(x: Tensor) -> Tensor:
-            return _beta(x).entropy().sum()
+            return beta(x).entropy().sum()
 
         if succeeds(here) < 0:
-            here = _climb(succeeds, [near], here)
+            here = climb(succeeds, [near], here)
         if succeeds(here) >= 0:
-            here = _climb(entropy, [near, succeeds], here)
+            here = climb(entropy, [near, succeeds], here)
         self.shapes = here.exp()
 
     def state_dict(self) -> dict[str, Any]:
@@ -100,41 +95,3 @@ class Doraemon:
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         self.shapes, self._seen = state["shapes"], [tuple(part) for part in state["seen"]]
-
-
-def _beta(x: Tensor) -> Beta:
-    """Of the logarithms of the parameters, [D, 2]."""
-    return Beta(*x.exp().unbind(-1), validate_args=False)
-
-
-def _climb(goal: Function, limits: Sequence[Function], start: Tensor) -> Tensor:
-    """Where `goal` is highest with all `limits` at least 0, from a start that keeps them; the start if none is found.
-
-    Args:
-        goal, limits: Of logarithms of parameters [D, 2].
-        start: [D, 2].
-    """
-
-    def value(f: Function, sign: float) -> Callable[[np.ndarray], float]:
-        return lambda x: sign * float(f(torch.from_numpy(x).view_as(start)))
-
-    def slope(f: Function, sign: float) -> Callable[[np.ndarray], np.ndarray]:
-        def at(x: np.ndarray) -> np.ndarray:
-            point = torch.from_numpy(x.copy()).requires_grad_()
-            f(point.view_as(start)).backward()
-            assert point.grad is not None
-            return sign * point.grad.numpy()
-
-        return at
-
-    found = minimize(
-        value(goal, -1.0),
-        start.flatten().numpy(),
-        jac=slope(goal, -1.0),
-        bounds=[(0.0, float(np.log(MOST)))] * start.numel(),
-        constraints=[{"type": "ineq", "fun": value(f, 1.0), "jac": slope(f, 1.0)} for f in limits],
-        method="SLSQP",
-    )
-    end = torch.from_numpy(found.x).view_as(start)
-    keeps = all(float(f(end)) > -EDGE for f in limits)
-    return end if keeps and goal(end) > goal(start) else start

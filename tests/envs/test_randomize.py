@@ -44,6 +44,17 @@ def test_a_place_in_a_range_is_a_number_of_its_unit() -> None:
     np.testing.assert_allclose([steep.value(x) for x in (0, 0.5, 1)], [0.5, 2, 8])
 
 
+def test_a_model_of_ones_own_is_changed_as_those_of_the_batch(make_backend) -> None:
+    backend = make_backend("push", 3, randomised=True)
+    backend.reset(np.arange(3))
+    draws = backend.randomizer.draws
+    for sim, places in enumerate(backend.randomizer.places):
+        model = randomize.changed(backend.model, draws, [d.value(x) for d, x in zip(draws, places, strict=True)])
+        for name, array in _drawn(backend).items():
+            np.testing.assert_array_equal(getattr(model, name), array[sim], name)
+        assert model.body_subtreemass[0] != backend.model.body_subtreemass[0], "what follows from the mass, too"
+
+
 def test_beta_distributions_take_the_place_of_uniform_ones(make_backend) -> None:
     backend = make_backend("push", 400, randomised=True)
     backend.randomizer.shapes = np.array([[1.0, 1.0], [90.0, 10.0], [1.0, 1.0], [2.0, 2.0]])  # in the table's order

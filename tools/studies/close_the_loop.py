@@ -6,12 +6,15 @@
 Each gap and seed has a folder under --runs; a first deployment or a comparison that is there is not made again. The gap
 is known to the two deployments alone. `--curves` writes what came of it as `tools.studies.benchmark --with` takes it
 in: success before, and what the agent that was trained again reaches before it learns from anything real itself. With
-`--effects` only those are looked for, as where one thinks beforehand of what may differ.
+`--effects` only those are looked for, as where one thinks beforehand of what may differ; with `--ranges` nothing is
+named, and ranges of the randomisation are found instead, which is the method `dropo`.
 """
 
 import argparse
 import json
 from pathlib import Path
+
+import yaml
 
 from mpc_sgft.diagnose.__main__ import main as diagnose
 from tools.studies.runner import finished, write
@@ -41,42 +44,42 @@ def main() -> None:
     parser.add_argument("--transitions", type=int, default=60_000)
     parser.add_argument("--set", nargs="*", default=[], metavar="name=value", help="overrides of the deployments")
     parser.add_argument("--effects", metavar="A,B", help="look for these alone")
-    parser.add_argument("--curves", type=Path, metavar="CSV", help="success before and after, as a method `identify`")
+    parser.add_argument("--ranges", metavar="RANDOMIZE", help="find ranges of this randomisation, and name nothing")
+    parser.add_argument("--curves", type=Path, metavar="CSV", help="success before and after, as a method of its own")
     parser.add_argument("--runs", type=Path, default=Path("runs/close_the_loop"))
     args = parser.parse_args()
     how = ["--retrain", "--retrain-transitions", str(args.transitions)]
     how += ["--effects", args.effects] if args.effects else []
+    how += ["--ranges", args.ranges] if args.ranges else []
+    folder, variant = "diagnosis", ""
+    if args.effects:
+        variant = f"effects={args.effects}"
+    if args.ranges:
+        folder, variant = "ranges", f"ranges={args.ranges}"
     rows, curves = [], []
     for gap in args.gaps:
         for seed in args.seeds:
             run = args.runs / f"{gap}-{seed}"
-            rows.append(one(gap, seed, run, args.set, how))
+            rows.append(one(gap, seed, run, run / folder, args.set, how))
             write(args.csv, COLUMNS, rows)
             if args.curves:
-                curves += curve(rows[-1], run, args.effects)
+                curves += curve(rows[-1], run, run / folder, variant)
                 write(args.curves, CURVE, curves)
 
 
-def one(gap: str, seed: int, run: Path, overrides: list[str], how: list[str]) -> dict[str, object]:
+def one(gap: str, seed: int, run: Path, found: Path, overrides: list[str], how: list[str]) -> dict[str, object]:
     """One row; raises RunFailed or SystemExit if a command fails.
 
     Args:
         gap, seed, overrides: Of the deployments.
         run: Folder of the first.
+        found: Of the diagnosis.
         how: Options of `diagnose --run`.
     """
     finished("deploy", run, [f"gap={gap}", f"seed={seed}", "log.rerun=false", *overrides])
-    found = run / "diagnosis"
     if not ((found / "retrain.json").exists() or named_nothing(found / "report.json")):
-        check(diagnose(["--run", str(run), *how]))
-    report = json.loads((found / "report.json").read_text())
-    row: dict[str, object] = {
-        "gap": gap,
-        "seed": seed,
-        "verdict": report["verdict"],
-        "found": " + ".join(words(e) for e in report["effects"]),
-        "diagnose_seconds": report["seconds"],
-    }
+        check(diagnose(["--run", str(run), "--out", str(found), *how]))
+    row: dict[str, object] = {"gap": gap, "seed": seed} | named(found)
     if (found / "retrain.json").exists():  # a verdict without an effect leaves nothing to retrain on
         result = json.loads((found / "retrain.json").read_text())
         row["transitions"] = result["transitions"]
@@ -87,20 +90,31 @@ def one(gap: str, seed: int, run: Path, overrides: list[str], how: list[str]) ->
     return row
 
 
+def named(found: Path) -> dict[str, object]:
+    """What a diagnosis says, of effects or of ranges."""
+    if (found / "ranges.yaml").exists():
+        draws = yaml.safe_load((found / "ranges.yaml").read_text())["draws"]
+        return {"verdict": "ranges", "found": " + ".join(f"{k} {d['low']} to {d['high']}" for k, d in draws.items())}
+    report = json.loads((found / "report.json").read_text())
+    effects = " + ".join(words(e) for e in report["effects"])
+    return {"verdict": report["verdict"], "found": effects, "diagnose_seconds": report["seconds"]}
+
+
 def named_nothing(report: Path) -> bool:
     """Whether a report is there, and holds no effect to train again with."""
     return report.exists() and not json.loads(report.read_text())["effects"]
 
 
-def curve(row: dict[str, object], run: Path, effects: str | None) -> list[dict[str, object]]:
+def curve(row: dict[str, object], run: Path, found: Path, variant: str) -> list[dict[str, object]]:
     """The rows of a learning curve: before, and after the real rollouts that were diagnosed.
 
     Where nothing was named nothing is trained again, and the agent stays as it was.
     """
     summary = json.loads((run / "summary.json").read_text())
-    again = run / "diagnosis" / "deploy" / "summary.json"
+    again = found / "deploy" / "summary.json"
     after = json.loads(again.read_text()) if "zero_shot_after" in row else summary
-    known = {"gap": row["gap"], "method": "identify", "variant": f"effects={effects}" if effects else ""}
+    method = "dropo" if row["verdict"] == "ranges" else "identify"
+    known = {"gap": row["gap"], "method": method, "variant": variant}
     known |= {"seed": row["seed"], "episodes": summary["evaluation_episodes"]}
     return [
         known | {"rollouts": rollouts, "success": s["curve"]["0"], "return": s["return_curve"]["0"]}

@@ -8,7 +8,7 @@ A window begins where the objects rest, because their velocities are not observe
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import mujoco
@@ -28,6 +28,7 @@ from mpc_sgft.diagnose.deployments.recordings import Deployment, joint_columns
 
 STATE = mujoco.mjtState.mjSTATE_FULLPHYSICS
 JOINT_SAMPLES = 5  # joints are compared so often in a control step
+Controls = Callable[[int, NDArray[np.floating]], Array]  # of an episode, at times [M, steps] -> [M, steps, nu]
 EXPLODED = 1e3  # predictions are clipped here, so that an unstable candidate is bad, not infinite
 
 
@@ -107,12 +108,28 @@ class Motion:
         w = self.windows
         pick = np.arange(len(w.start)) if pick is None else pick
         rows = [
-            self._run(list(effects), pick, None if nudge is None else nudge[k]) for k, effects in enumerate(changes)
+            self.run(self._model(list(effects)), effects, pick, None if nudge is None else nudge[k])
+            for k, effects in enumerate(changes)
         ]
         return Outcome(*(np.stack(parts) for parts in zip(*rows, strict=True)))
 
-    def _run(self, effects: list[Effect], pick: Index, nudge: Array | None) -> Outcome:
-        w, m = self.windows, self._model(effects)
+    def run(
+        self,
+        m: mujoco.MjModel,
+        effects: Sequence[Effect],
+        pick: Index,
+        nudge: Array | None = None,
+        controls: Controls | None = None,
+    ) -> Outcome:
+        """Predictions of one changed model, without the first axis.
+
+        Args:
+            m: The scene's, changed.
+            effects: That it was changed by, of which those of sensors act here.
+            pick, nudge: As in `simulate`.
+            controls: What drives the servos of an episode's windows, in place of what was measured.
+        """
+        w, controls = self.windows, controls or self._measured
         late = sum(e.delay for e in effects if isinstance(e, SensorDelay))
         steps, nu, nj = w.samples * self.substeps, self.model.nu, len(self.qadr)
         state = np.zeros((len(pick), mujoco.mj_stateSize(m, STATE)))
@@ -129,7 +146,7 @@ class Motion:
             state[mine, 1 : 1 + self.model.nq] = qpos
             state[mine, 1 + m.nq : 1 + m.nq + self.model.nv] = qvel
             ends = begin[:, None] + self.h * np.arange(1, steps + 1)
-            inputs[mine, :, :nu] = at_times(e.time, self.drive[i], ends)
+            inputs[mine, :, :nu] = controls(i, ends)
             measured[mine] = at_times(e.time, e.q, ends[:, self._compared() - 1])
         data = self.workers if m is self.model else [mujoco.MjData(m) for _ in self.workers]
         out = np.asarray(mujoco.rollout.rollout(m, data, state, inputs, skip_checks=False)[0])
@@ -139,6 +156,9 @@ class Motion:
         qpos, qvel = ends[..., 1 : 1 + self.model.nq], ends[..., 1 + m.nq : 1 + m.nq + self.model.nv]
         flat = self.task.observe(qpos.reshape(-1, self.model.nq), qvel.reshape(-1, self.model.nv))
         return Outcome(joints, sensed(self.task, effects, flat).reshape(len(pick), w.samples, -1))
+
+    def _measured(self, episode: int, ends: NDArray[np.floating]) -> Array:
+        return at_times(self.episodes[episode].time, self.drive[episode], ends)
 
     def _compared(self) -> Index:
         """Physics steps after which joints are compared, counted from 1, [n JOINT_SAMPLES]."""

@@ -1,4 +1,4 @@
-"""Close the loop: go on pretraining in the repaired simulator, deploy again, and compare.
+"""Close the loop: go on pretraining in the repaired simulator, or in ranges found, deploy again, and compare.
 
 The gap of the run is handed to the second deployment alone, as a robot would be: diagnosis and retraining know only
 what was found.
@@ -21,14 +21,22 @@ HELD = 3  # share of retraining, one in so many, that leaves encoder and V alone
 HEAD = "              |  zero-shot |    final | rollouts to 95 %"
 
 
-def retrain(run: Path, effects: Mapping[str, Mapping[str, Any]], out: Path, transitions: int) -> dict[str, Any]:
-    """Pretrain from the run's own start with the found effects, deploy again; returns the comparison.
+def retrain(
+    run: Path,
+    out: Path,
+    transitions: int,
+    *,
+    effects: Mapping[str, Mapping[str, Any]] | None = None,
+    randomize: Mapping[str, Any] | None = None,
+) -> dict[str, Any]:
+    """Pretrain from the run's own start with what was found, deploy again; returns the comparison.
 
     Args:
         run: Folder of the finished first deployment.
-        effects: {effect: parameters} that diagnose found.
         out: Folder for `pretrain/`, `deploy/` and retrain.json.
         transitions: Of pretraining in the repaired simulator.
+        effects: {effect: parameters} that diagnose found; None: none.
+        randomize: As in configs/randomize/*.yaml, found; None: the task's own.
 
     Raises:
         UserError: If the run was not finished, or a folder of an earlier retraining is in the way.
@@ -37,7 +45,8 @@ def retrain(run: Path, effects: Mapping[str, Mapping[str, Any]], out: Path, tran
     from mpc_sgft.runs.pretrain import pretrain
 
     cfg, before = run_config(run), outcome(run)
-    _finish(pretrain(pretrain_config(cfg, effects, out / "pretrain", transitions)), "pretraining")
+    made = pretrain_config(cfg, out / "pretrain", transitions, effects=effects, randomize=randomize)
+    _finish(pretrain(made), "pretraining")
     again = OmegaConf.create(OmegaConf.to_container(cfg, resolve=True))
     assert isinstance(again, DictConfig)
     again.checkpoint, again.run_dir, again.resume = str(out / "pretrain"), str(out / "deploy"), None
@@ -47,14 +56,21 @@ def retrain(run: Path, effects: Mapping[str, Mapping[str, Any]], out: Path, tran
     return result
 
 
-def pretrain_config(cfg: DictConfig, effects: Mapping[str, Any], folder: Path, transitions: int) -> DictConfig:
+def pretrain_config(
+    cfg: DictConfig,
+    folder: Path,
+    transitions: int,
+    *,
+    effects: Mapping[str, Any] | None = None,
+    randomize: Mapping[str, Any] | None = None,
+) -> DictConfig:
     """The config of pretraining in the repaired simulator, from the config of a deployment.
 
     Args:
         cfg: Of the deployment; its gap is not used.
-        effects: Of the repaired simulator.
         folder: Run folder to write.
         transitions: How long.
+        effects, randomize: As in `retrain`.
     """
     from mpc_sgft.command import compose
     from mpc_sgft.runs import build
@@ -64,8 +80,10 @@ def pretrain_config(cfg: DictConfig, effects: Mapping[str, Any], folder: Path, t
     with open_dict(made):
         made.task, made.planner, made.seed, made.device = cfg.task, cfg.planner, cfg.seed, cfg.device
         made.checkpoint = cfg.checkpoint if cfg.checkpoint is not None else str(build.shipped(build.agents_of(cfg)))
-        made.gap.effects = dict(effects)
-        made.chosen.gap = "+".join(["none", *effects])
+        made.gap.effects = dict(effects or {})
+        made.chosen.gap = "+".join(["none", *(effects or {})])
+        if randomize is not None:
+            made.randomize = dict(randomize)
         made.run_dir, made.quiet = str(folder), cfg.quiet
         made.transitions = made.min_transitions = transitions
         made.eval_episodes = made.final_episodes = cfg.eval_episodes

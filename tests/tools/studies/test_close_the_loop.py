@@ -39,3 +39,20 @@ def test_what_was_measured_is_written_and_nothing_runs_again(tmp_path: Path, mon
     seeds = read_curves([tmp_path / "curves.csv"])["turned"]["identify"]
     successes = {seed: [curve[n]["success"] for n in (0, 10)] for seed, curve in seeds.items()}
     assert successes == {0: ["0.1", "0.9"], 1: ["0.1", "0.1"]}  # who names nothing trains nothing again
+
+
+def test_ranges_are_a_method_of_their_own_beside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = tmp_path / "runs" / "turned-0"
+    deployment(run, 0.1)
+    deployment(run / "ranges" / "deploy", 0.7)
+    outcome = {"zero_shot_success": 0.7, "final_success": 0.7, "rollouts_to_95": None}
+    both = {"transitions": 60000, "before": outcome | {"zero_shot_success": 0.1}, "after": outcome}
+    (run / "ranges" / "retrain.json").write_text(json.dumps(both))
+    (run / "ranges" / "ranges.yaml").write_text("draws: {mass: {low: 1.5, high: 1.7}}")
+    words = ["loop", str(tmp_path / "loop.csv"), "--gaps", "turned", "--seeds", "0", "--runs", f"{tmp_path}/runs"]
+    monkeypatch.setattr("sys.argv", [*words, "--ranges", "push", "--curves", str(tmp_path / "curves.csv")])
+    close_the_loop.main()
+    (row,) = csv.DictReader((tmp_path / "loop.csv").open())
+    assert (row["verdict"], row["found"], row["zero_shot_after"]) == ("ranges", "mass 1.5 to 1.7", "0.7")
+    seeds = read_curves([tmp_path / "curves.csv"])["turned"]
+    assert set(seeds) == {"dropo ranges=push"}

@@ -16,7 +16,7 @@ FOUND = {"actuator_gain": {"gain": 0.52}, "payload": {"mass": 0.4, "at": ["puck"
 
 def test_pretraining_gets_the_found_effects_and_not_the_gap(tmp_path: Path) -> None:
     run = compose.compose("deploy", ["task=push", "gap=dev_late", "seed=4"], ["gap=dev_late"])
-    made = pretrain_config(run, FOUND, tmp_path, 5000)
+    made = pretrain_config(run, tmp_path, 5000, effects=FOUND)
     assert made.gap.effects == FOUND and "dev_late" not in str(made)
     assert (made.transitions, made.random_transitions, made.seed) == (5000, 0, 4)
     assert Path(made.checkpoint).name == "push.safetensors" and made.task == run.task
