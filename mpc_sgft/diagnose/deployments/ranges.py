@@ -83,15 +83,15 @@ def find_ranges(
     Raises:
         UserError: If nothing is drawn, a draw does not fit the scene, or no window can be cut.
     """
+    chain = Chain(deployment, LENGTH, MOST)
     with from_config("randomize"):
         draws = dict(zip(entries["draws"], randomize.load(entries["draws"]), strict=True))
-        if not draws:
-            raise UserError("--ranges: nothing is drawn there, so there is nothing to find. Give another one.")
-        chain = Chain(deployment, LENGTH, MOST)
         simulator = _Simulator(chain, list(draws.values()))
-        end = chain.observed[:, -1], chain.observation_scale[:, -1]
-        how = {"seed": seed, "rounds": rounds, "samples": samples}
-        shapes = dropo(simulator.outcomes, len(draws), *end, **how, track=track)
+    if not draws:
+        raise UserError("--ranges: nothing is drawn there, so there is nothing to find. Give another one.")
+    end = chain.observed[:, -1], chain.observation_scale[:, -1]
+    how = {"seed": seed, "rounds": rounds, "samples": samples}
+    shapes = dropo(simulator.outcomes, len(draws), *end, **how, track=track)
     found = {name: dict(entry) for name, entry in entries["draws"].items()}
     places = betaincinv(*shapes.T.numpy()[..., None], CENTRAL)  # [D, 2]
     for entry, draw, (low, high) in zip(found.values(), draws.values(), places, strict=True):
