@@ -1,4 +1,4 @@
-"""From overrides to one config that holds only known names. The one place, with cli.py, that speaks to Hydra."""
+"""From overrides to one config that holds only known names. The one place, with cli.py, that composes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From a config to the objects of a run: the only place where names in yaml become things."""
+"""From a config to the objects that all loops share: environments, planners, agents."""
 
 import copy
 import logging

@@ -13,7 +13,7 @@ counts episodes. Entities:
 | world/imagined/*        | where the model, at this step, imagines end effector and object over the next H steps   |
 | world/ghost/*           | where it thought one step ago that they would be now                                    |
 | world/candidates        | the planner's candidate plans of selected steps, dark (worst) to yellow (best)          |
-| value_map/<name>        | a value over the end effector's x and y                                                 |
+| value_map/<name>        | a value over two quantities that the task names                                         |
 | returns, model_error, … | plots                                                                                   |
 | episodes                | outcomes in words                                                                       |
 """

@@ -1,1 +1,1 @@
-"""A deployment as a chain, command to drive to motion to observation, and retraining on what it lacks."""
+"""A deployment as a chain, command to drive to motion to observation, what explains it, and retraining on that."""

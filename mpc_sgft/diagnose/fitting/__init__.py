@@ -1,1 +1,1 @@
-"""How well a set of effects explains the measurement, and which sets are worth a fit."""
+"""How well a set of effects explains the measurement, which sets are worth a fit, and which ranges explain it."""
