@@ -1,4 +1,4 @@
-"""World model + optimisers: update() is the TD-MPC2 objective; what methods of deployment add is in files of its own."""
+"""World model + optimisers: update() is the TD-MPC2 objective; methods of deployment add to it elsewhere."""
 
 import hashlib
 from collections.abc import Iterator, Mapping, Sequence
