@@ -1,4 +1,4 @@
-"""`python -m mpc_sgft.diagnose --model scene.xml --data EPISODES... --out OUT`, or `--run RUN_FOLDER`, with `--ranges` too"""
+"""`python -m mpc_sgft.diagnose --model scene.xml --data EPISODES... --out OUT`, or `--run RUN_FOLDER`"""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Run many deployments, side by side and resumable, and collect their learning curves into one CSV.
 
     python -m tools.studies.study results/transfer/sgft.csv --gaps turned sluggish skate --seeds 0 1 2 3 4
-    python -m tools.studies.study results/horizon/horizon.csv --gaps sluggish --variants horizon=1 horizon=2 method.anchor=0
+    python -m tools.studies.study out.csv --gaps sluggish --variants horizon=1 "horizon=2 method.anchor=0"
 
 Each run is `python -m mpc_sgft.deploy` in a process of its own with one thread; its folder is kept under --runs, and a
 run whose summary is there is not repeated; --launcher starts the runs on other machines. With several --checkpoints,
