@@ -30,6 +30,7 @@ from mpc_sgft.diagnose.fitting.dropo import ROUNDS, SAMPLES, dropo
 
 LENGTH = 6  # control steps in a window
 MOST = 64  # windows
+FLAT, STEEP = 1e-3, 2.0  # a Beta distribution with a = 1 and b above this one is densest at 0
 CENTRAL = (0.05, 0.95)  # of a distribution, which pretraining draws from evenly
 
 
@@ -48,6 +49,12 @@ class Ranges(NamedTuple):
     shapes: Tensor
     windows: int
 
+    @property
+    def at_an_end(self) -> list[str]:
+        """Draws likeliest at an end of where they were looked for: the truth may lie beyond."""
+        ends = (self.shapes.amin(1) < 1 + FLAT) & (self.shapes.amax(1) > STEEP)
+        return [name for name, at_end in zip(self.draws, ends.tolist(), strict=True) if at_end]
+
     def table(self) -> str:
         """For the terminal."""
         lines = ["draw          | looked for within | found (90 %)"]
@@ -55,6 +62,8 @@ class Ranges(NamedTuple):
             found = self.randomize["draws"][name]
             within = f"{draw.low:.4g} to {draw.high:.4g}"
             lines.append(f"{name:13} | {within:>17} | {found['low']:.4g} to {found['high']:.4g}")
+        if self.at_an_end:
+            lines.append(f"at an end of its range: {', '.join(self.at_an_end)}; look within a wider randomisation")
         return "\n".join(lines)
 
     def write(self, path: Path) -> None:

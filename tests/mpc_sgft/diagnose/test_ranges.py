@@ -31,7 +31,7 @@ def test_the_command_writes_what_pretraining_takes(deployed, tmp_path: Path, cap
     assert main(["--run", str(run), "--ranges", "pendulum"]) == 0
     said = capsys.readouterr().out
     path = run / "diagnosis" / "ranges.yaml"
-    assert "looked for within" in said and str(path) in said
+    assert "looked for within" in said and "at an end" not in said and str(path) in said
     found = yaml.safe_load(path.read_text())["draws"]
     low, high = found["damping"]["low"], found["damping"]["high"]
     assert low < 1.6 < high and high - low < 0.2, "0.05 and 0.03 N m s/rad"
@@ -39,6 +39,12 @@ def test_the_command_writes_what_pretraining_takes(deployed, tmp_path: Path, cap
     given = compose.spread(["task=pendulum", f"randomize={path}"])
     cfg = compose.compose("pretrain", [compose.normalise(text) for text in given], given)
     assert cfg.randomize.draws == found and cfg.randomize.noise_sd == 0
+
+
+def test_a_truth_beyond_the_ranges_is_suspected(deployed) -> None:
+    run = deployed({"viscous_friction": {"coefficient": 0.08}}, task_name="pendulum", episodes=3)
+    found = find_ranges(read_deployment(run), randomisation(run, "pendulum"), seed=0)
+    assert found.at_an_end == ["damping"] and "at an end of its range: damping; look within a wider" in found.table()
 
 
 @pytest.mark.parametrize(
