@@ -7,7 +7,8 @@ import torch
 from torch import Tensor
 from torch.distributions import kl_divergence
 
-from mpc_sgft.learning.beta import EDGE, MOST, beta, climb
+from mpc_sgft.learning.beta import EDGE, MOST, beta
+from mpc_sgft.learning.climb import climb
 
 
 class Doraemon:

@@ -2,6 +2,7 @@
 
 import copy
 import logging
+from collections.abc import Mapping
 from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -9,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 import torch
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
-from scipy.special import betaincinv
 from torch import Tensor
 
 import mpc_sgft
@@ -18,6 +18,7 @@ from envs.backends.sim import SimBackend
 from envs.env import ControlEnv
 from mpc_sgft.command.errors import UserError, from_config
 from mpc_sgft.learning.agent import Agent
+from mpc_sgft.learning.beta import quantile
 from mpc_sgft.learning.observation_map import Sensed
 from mpc_sgft.learning.world_model import WorldModel
 from mpc_sgft.storage import checkpoint
@@ -103,12 +104,12 @@ def make_curriculum(cfg: DictConfig) -> "Doraemon | None":
         return instantiate(cfg.curriculum, draws=len(cfg.randomize.draws))
 
 
-def drawn_ranges(cfg: DictConfig, shapes: Tensor) -> dict[str, list[float]]:
+def drawn_ranges(draws: Mapping[str, randomize.Draw], shapes: Tensor) -> dict[str, list[float]]:
     """Of each draw, where 90 % of what the Beta distributions [D, 2] draw lies, {name: [from, to]}, its own unit."""
-    ends = betaincinv(*shapes.T.numpy(), [[0.05], [0.95]]).T  # [D, 2]
+    ends = quantile(shapes, torch.tensor([[0.05], [0.95]], dtype=torch.float64)).T  # [D, 2]
     return {
-        name: [round(draw.value(float(x)), 4) for x in places]
-        for (name, draw), places in zip(draws_of(cfg).items(), ends, strict=True)
+        name: [float(f"{draw.value(x):.5g}") for x in places]
+        for (name, draw), places in zip(draws.items(), ends.tolist(), strict=True)
     }
 
 

@@ -149,7 +149,7 @@ def pretrain(cfg: DictConfig) -> int:
         "return": planned.episode_return,
         "unstable_episodes": state["unstable"],
         "wall_seconds": round(time.monotonic() - began, 1),
-        "randomize": None if curriculum is None else build.drawn_ranges(cfg, curriculum.shapes),
+        "randomize": None if curriculum is None else build.drawn_ranges(build.draws_of(cfg), curriculum.shapes),
         "peak_memory_mb": peak_memory_mb(),
         "seconds": watch.rounded(),
         "checkpoint": str(folder / "checkpoint" / "model.safetensors"),

@@ -7,7 +7,7 @@ Z = NormalDist().inv_cdf(0.975)
 
 
 def wilson(hits: float, count: int) -> tuple[float, float]:
-    """95 % interval of a share (E. B. Wilson, 1927), without scipy.stats, which takes a second to import.
+    """95 % interval of a share (E. B. Wilson, 1927), without scipy.stats, which takes long to import.
 
     Returns:
         Its two ends; nan without data.

@@ -13,7 +13,7 @@ No checkpoint is driven for it; the recordings may be of another one. With `--ga
 and how well the ranking foretells that is printed (Spearman's correlation), beside either half of it alone.
 
 What differs from the publication: latents of the world model's encoder are looked at, where there it is a network for
-images, and the two halves have the same weight, as z-scores.
+images. One distance, and the same weight of both halves, are our choice.
 
 Source: Leibovich et al., "Validate on Sim, Detect on Real: Model Selection for Domain Randomization", ICRA 2022,
 arXiv:2111.00765.
@@ -67,6 +67,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     args = parser.parse_args(arguments)
     if len(args.checkpoints) < 2:
         parser.error("--checkpoints: a ranking takes two or more.")
+    if args.episodes < 2:
+        parser.error(f"--episodes {args.episodes}: two or more, half of them are the yardstick.")
     try:
         task, real = recorded(args.run)
         rows = [row(path, task, real, args.gap, args.episodes, args.seed) for path in args.checkpoints]

@@ -14,7 +14,6 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 from omegaconf import OmegaConf
-from scipy.special import betaincinv
 from torch import Tensor
 
 from envs import randomize
@@ -27,11 +26,11 @@ from mpc_sgft.diagnose.deployments.command_link import measured_drive
 from mpc_sgft.diagnose.deployments.motion_link import at_times
 from mpc_sgft.diagnose.deployments.recordings import Deployment, run_config
 from mpc_sgft.diagnose.fitting.dropo import ROUNDS, SAMPLES, dropo
+from mpc_sgft.runs.build import drawn_ranges
 
 LENGTH = 6  # control steps in a window
 MOST = 64  # windows
 FLAT, STEEP = 1e-3, 2.0  # a Beta distribution with a = 1 and b above this one is densest at 0
-CENTRAL = (0.05, 0.95)  # of a distribution, which pretraining draws from evenly
 
 
 class Ranges(NamedTuple):
@@ -102,9 +101,8 @@ def find_ranges(
     how = {"seed": seed, "rounds": rounds, "samples": samples}
     shapes = dropo(simulator.outcomes, len(draws), *end, **how, track=track)
     found = {name: dict(entry) for name, entry in entries["draws"].items()}
-    places = betaincinv(*shapes.T.numpy()[..., None], CENTRAL)  # [D, 2]
-    for entry, draw, (low, high) in zip(found.values(), draws.values(), places, strict=True):
-        entry["low"], entry["high"] = (float(f"{draw.value(x):.5g}") for x in (low, high))
+    for name, (low, high) in drawn_ranges(draws, shapes).items():
+        found[name] |= {"low": low, "high": high}
     return Ranges({**entries, "draws": found}, draws, shapes, len(chain.windows.start))
 
 

@@ -2,15 +2,14 @@
 
 from collections.abc import Callable, Iterable
 
-import numpy as np
 import torch
-from scipy.special import betaincinv
 from torch import Tensor
 from torch.distributions import MultivariateNormal
 from torch.quasirandom import SobolEngine
 
 from mpc_sgft.diagnose.data.measured import Array
-from mpc_sgft.learning.beta import EDGE, beta, climb
+from mpc_sgft.learning.beta import EDGE, beta, quantile
+from mpc_sgft.learning.climb import climb
 
 ROUNDS = 8
 SAMPLES = 64  # of the numbers, each round
@@ -67,7 +66,7 @@ def dropo(
     engine = SobolEngine(draws, scramble=True, seed=seed)
     here = torch.zeros(draws, 2, dtype=torch.float64)  # logarithms: uniform
     for _ in track(range(rounds)):
-        places = _places(engine.draw(samples, dtype=torch.float64), here.exp())
+        places = quantile(here.exp(), engine.draw(samples, dtype=torch.float64)).clamp(EDGE, 1 - EDGE)  # [M, D]
         outcome = torch.from_numpy(simulate(places.numpy()) / scale)  # [M, W, S]
         density = beta(here).log_prob(places).sum(1)
 
@@ -78,7 +77,8 @@ def dropo(
             w = weights(x)
             mean = torch.einsum("m,mws->ws", w, outcome)
             off = outcome - mean
-            cov = torch.einsum("m,mwi,mwj->wij", w, off, off) / (1 - (w**2).sum()).clamp(min=0.5)
+            told = (1 - (w**2).sum()).clamp(min=0.5)  # less only where the solver tries what does not reach
+            cov = torch.einsum("m,mwi,mwj->wij", w, off, off) / told
             return MultivariateNormal(mean, cov + unit, validate_args=False).log_prob(truth).mean()
 
         def reaches(x: Tensor) -> Tensor:
@@ -86,9 +86,3 @@ def dropo(
 
         here = climb(likely, [reaches], here)
     return here.exp()
-
-
-def _places(uniform: Tensor, shapes: Tensor) -> Tensor:
-    """Numbers [M, D] of the uniform distribution as numbers of Beta distributions [D, 2]."""
-    places = betaincinv(*shapes.T.numpy(), uniform.numpy())
-    return torch.from_numpy(np.clip(places, EDGE, 1 - EDGE))

@@ -87,7 +87,7 @@ def test_found_effects_and_draws_combine():
 def test_ranges_are_told_in_the_draws_own_units():
     cfg = config(randomize={"draws": {"latency": {"low": 0.0, "high": 0.4}}})
     shapes = torch.tensor([[1.0, 1.0]] * 3 + [[50.0, 50.0]], dtype=torch.float64)
-    found = build.drawn_ranges(cfg, shapes)
+    found = build.drawn_ranges(build.draws_of(cfg), shapes)
     assert found["friction"] == [0.7875, 1.4625]
     low, high = found["latency"]
     assert low + high == pytest.approx(0.4) and high - low == pytest.approx(2 * 1.645 * 0.4 * 0.05, rel=0.02)
