@@ -1,5 +1,7 @@
 """ControlEnv: one TorchRL environment for every task on every backend."""
 
+from collections.abc import Callable
+
 import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -7,6 +9,7 @@ from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from envs.backends.base import Backend
+from envs.task import Array
 
 
 class ControlEnv(EnvBase):
@@ -21,9 +24,10 @@ class ControlEnv(EnvBase):
     Args:
         backend: Where actions go.
         history: How many past observations and actions to add.
+        privileged: What only a simulator knows now, [N, X]: stands under `privileged` then, for learning alone.
     """
 
-    def __init__(self, backend: Backend, *, history: int = 0):
+    def __init__(self, backend: Backend, *, history: int = 0, privileged: Callable[[], Array] | None = None):
         if history < 0:
             raise ValueError(f"history={history}; it must be 0 or more")
         n = backend.num_envs
@@ -39,6 +43,9 @@ class ControlEnv(EnvBase):
             action_sent=Unbounded(torch.Size([n, self.action_dim]), dtype=torch.float32),
             shape=(n,),
         )
+        self._privileged = privileged
+        if privileged is not None:
+            self.observation_spec["privileged"] = Unbounded(torch.Size(privileged().shape), dtype=torch.float32)
         self.action_spec = Bounded(-1.0, 1.0, torch.Size([n, self.action_dim]), dtype=torch.float32)
         self.reward_spec = Unbounded(torch.Size([n, 1]), dtype=torch.float32)
         self.done_spec = Composite(done=Binary(**flag), terminated=Binary(**flag), truncated=Binary(**flag), shape=(n,))
@@ -62,6 +69,7 @@ class ControlEnv(EnvBase):
         return TensorDict(
             {
                 "observation": self._stacked(),
+                **self._known(),
                 "success": no,
                 "invalid": no.clone(),
                 "action_sent": torch.zeros(n, self.action_dim),
@@ -95,6 +103,7 @@ class ControlEnv(EnvBase):
         return TensorDict(
             {
                 "observation": self._stacked(),
+                **self._known(),
                 "success": torch.from_numpy(out.success)[:, None] & ~bad,
                 "invalid": bad,
                 "action_sent": torch.from_numpy(out.action_sent.astype(np.float32)),
@@ -105,6 +114,10 @@ class ControlEnv(EnvBase):
             },
             [self.backend.num_envs],
         )
+
+    def _known(self) -> dict[str, torch.Tensor]:
+        known = {} if self._privileged is None else {"privileged": self._privileged()}
+        return {name: torch.from_numpy(x.astype(np.float32)) for name, x in known.items()}
 
     def _stacked(self) -> torch.Tensor:
         """A fresh tensor each time: a reused one would change what was returned before."""

@@ -54,6 +54,25 @@ class QuickModel(Model, Protocol):
         ...
 
 
+class RecurrentModel(Model, Protocol):
+    """A model that also has a policy with a memory.
+
+    Attributes:
+        recurrent_policy: That policy; None: there is none.
+    """
+
+    recurrent_policy: object | None
+
+    def recurrent_action(
+        self, z: Tensor, memory: Tensor | None, begins: Tensor, noise: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
+        """Action as `policy_prior`, [B, A], and the new memory [B, R], after the step before's; None: nothing was seen.
+
+        `begins` [B] bool: episodes that begin here and remember nothing.
+        """
+        ...
+
+
 class Plan(NamedTuple):
     """What a planner decided and remembers; pass it back as `previous` to warm-start the next plan.
 
@@ -66,6 +85,7 @@ class Plan(NamedTuple):
     value: Tensor  # h_step_return of `mean`, reward units                    [B]
     candidates: Tensor | None = None  # last pool, with keep_candidates       [B, N, H, A]
     candidate_values: Tensor | None = None  # their h_step_return             [B, N]
+    memory: Tensor | None = None  # of a policy that has one, after `action`  [B, R]
 
 
 def h_step_return(model: Model, z: Tensor, actions: Tensor, discount: float) -> Tensor:
@@ -153,6 +173,22 @@ def imagine_policy(model: Model, z: Tensor, noise: Tensor | None, horizon: int) 
         actions.append(model.policy_prior(latents[-1], None if noise is None else noise[..., t, :]))
         latents.append(model.next(latents[-1], actions[-1]))
     return torch.stack(latents, -2), torch.stack(actions, -2)
+
+
+def imagine_recurrent(
+    model: RecurrentModel, z: Tensor, memory: Tensor | None, begins: Tensor, noise: Tensor | None, horizon: int
+) -> tuple[Tensor, Tensor, Tensor]:
+    """As `imagine_policy` from z [B, D], of the policy with a memory; also its memory after the first step, [B, R]."""
+    latents, actions, memories = [z], [], [memory]
+    for t in range(horizon):
+        drawn = None if noise is None else noise[:, t]
+        action, after = model.recurrent_action(latents[-1], memories[-1], begins & (t == 0), drawn)
+        actions.append(action)
+        memories.append(after)
+        latents.append(model.next(latents[-1], action))
+    first = memories[1]
+    assert first is not None
+    return torch.stack(latents, -2), torch.stack(actions, -2), first
 
 
 def imagined_return(model: Model, latents: Tensor, actions: Tensor, discount: float) -> Tensor:

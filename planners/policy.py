@@ -5,12 +5,23 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from planners.base import FiniteChecks, Model, Plan, check_discount, check_finite, imagine_policy, imagined_return
+from planners.base import (
+    FiniteChecks,
+    Model,
+    Plan,
+    check_discount,
+    check_finite,
+    imagine_policy,
+    imagine_recurrent,
+    imagined_return,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
 class PolicyPlanner:
     """The policy prior alone, imagined `horizon` steps ahead so that its plan has a value like any other.
+
+    A model's policy with a memory goes before its policy prior.
 
     Raises:
         ValueError: From the constructor, if a number is out of range.
@@ -37,7 +48,7 @@ class PolicyPlanner:
         keep_candidates: bool = False,
         explore: bool = False,
     ) -> Plan:
-        """Mean actions of the prior from z [B, D], or with `explore` the prior's own samples; remembers nothing.
+        """Mean actions of the prior from z [B, D], or with `explore` the prior's own samples.
 
         Arguments and errors as `SamplingPlanner.plan`; the plan is its own only candidate.
         """
@@ -45,10 +56,15 @@ class PolicyPlanner:
         checks.note("latents", z)
         shape = (len(z), self.horizon, self.action_dim)
         noise = torch.randn(shape, generator=generator, device=z.device, dtype=z.dtype) if explore else None
-        latents, mean = imagine_policy(model, z, noise, self.horizon)
+        if getattr(model, "recurrent_policy", None) is None:
+            memory, (latents, mean) = None, imagine_policy(model, z, noise, self.horizon)
+        else:
+            begins = torch.zeros(len(z), dtype=torch.bool, device=z.device) if fresh is None else fresh
+            before = None if previous is None else previous.memory
+            latents, mean, memory = imagine_recurrent(model, z, before, begins, noise, self.horizon)  # type: ignore
         checks.note_followed(latents, mean)
         value = imagined_return(model, latents, mean, self.discount)
         checks.note("values of the plan", value)
         check_finite("PolicyPlanner", checks.names, checks.stacked())
         kept = (mean.unsqueeze(1), value.unsqueeze(1)) if keep_candidates else (None, None)
-        return Plan(mean[:, 0], mean, torch.zeros_like(mean), value, *kept)
+        return Plan(mean[:, 0], mean, torch.zeros_like(mean), value, *kept, memory=memory)

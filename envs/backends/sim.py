@@ -167,6 +167,15 @@ class SimBackend:
             invalid=self._check_physics(),
         )
 
+    def privileged(self) -> Array:
+        """What no sensor says: the observation without noise or effects, and where each draw lies in its range, 0 to 1.
+
+        Returns:
+            [N, O + D]; zeros where the physics failed.
+        """
+        known = np.concatenate([self.task.observe(self.qpos, self.qvel), self.randomizer.places], 1)
+        return np.where(self.unstable[:, None], 0.0, known)
+
     def positions(self) -> Array:
         """Joint positions of the first simulation, as `model` has them: with the rotors of a gear that has play."""
         return self.state[0][0].copy()

@@ -25,6 +25,7 @@ from mpc_sgft.learning.layers import (
 from mpc_sgft.learning.observation_map import ObservationMap
 from mpc_sgft.learning.plan_values import PlanValues, PlanWeights
 from mpc_sgft.learning.precision import dtype_of_products
+from mpc_sgft.learning.recurrent_policy import RecurrentPolicy
 from planners.base import step_by_step
 
 PARTS = (
@@ -66,6 +67,7 @@ class WorldModel(nn.Module):
             dynamics; "current": from (z, a), as TD-MPC2 has it.
         terminal: What an imagined plan ends in: the "value" head, or "q", the mean of the target critics at the action
             of the policy, as TD-MPC2 has it (there of two critics that drop out).
+        recurrent_dim: Entries of the memory of a policy that stands beside the policy prior; 0: there is none.
 
     Raises:
         ValueError: If latent_dim is no multiple of simnorm_dim, decode_dim exceeds obs_dim, num_q < 2, or reward_from
@@ -91,6 +93,7 @@ class WorldModel(nn.Module):
         dropout: float = 0.01,
         reward_from: str = "next",
         terminal: str = "value",
+        recurrent_dim: int = 0,
     ) -> None:
         self_sizes = {k: v for k, v in locals().items() if k not in ("self", "__class__")}
         super().__init__()
@@ -128,6 +131,9 @@ class WorldModel(nn.Module):
         self.target_q = copy.deepcopy(self.q_ensemble).requires_grad_(False)
         self.value_head = mlp([latent_dim, mlp_dim, mlp_dim, num_bins], zero_out=True)
         self.policy_head = mlp([latent_dim, mlp_dim, mlp_dim, 2 * action_dim])
+        self.recurrent_policy: RecurrentPolicy | None = None
+        if recurrent_dim:
+            self.recurrent_policy = RecurrentPolicy(latent_dim, recurrent_dim, mlp_dim, action_dim)
         self.decoder = mlp([latent_dim, mlp_dim, decode_dim])
 
     # -- what a planner calls ------------------------------------------------------------------------------------------
@@ -151,6 +157,15 @@ class WorldModel(nn.Module):
         """Action of the policy in [-1, 1], [..., A]; noise None gives tanh of the mean."""
         mean, log_std = self._policy_moments(z)
         return torch.tanh(mean if noise is None else mean + log_std.exp() * noise)
+
+    def recurrent_action(
+        self, z: Tensor, memory: Tensor | None, begins: Tensor, noise: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
+        """As `policy_prior`, of the policy that remembers, and its new memory; see `RecurrentPolicy`."""
+        assert self.recurrent_policy is not None
+        moments, after = self.recurrent_policy(z, memory, begins)
+        mean, log_std = _moments(moments)
+        return torch.tanh(mean if noise is None else mean + log_std.exp() * noise), after
 
     def plan_values(self, z: Tensor, discount: float, precision: str, rows: int) -> Callable[[Tensor], Tensor]:
         """Values many plans from the latents z [B, D] at once, in the precision of configs/planner/mppi.yaml.
@@ -203,10 +218,42 @@ class WorldModel(nn.Module):
         return gaussian_tanh_log_prob(*self._policy_moments(z), action)
 
     def _policy_moments(self, z: Tensor) -> tuple[Tensor, Tensor]:
-        mean, log_std = by_blocks(self.policy_head, z).chunk(2, -1)
-        return mean, LOG_STD_MIN + 0.5 * (LOG_STD_MAX - LOG_STD_MIN) * (torch.tanh(log_std) + 1)
+        return _moments(by_blocks(self.policy_head, z))
+
+    def moments_along(self, z: Tensor, begins: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean and log-deviation before the tanh of the policy that acts along rows of latents [B, T, D].
+
+        Args:
+            z: Latents.
+            begins: Where an episode begins, bool [B, T]; a policy with a memory forgets what was before.
+        """
+        if self.recurrent_policy is None:
+            return self._policy_moments(z)
+        return _moments(self.recurrent_policy.along(z, begins))
 
     # -- changes of the model itself -----------------------------------------------------------------------------------
+
+    def begin_policy(self, memory_dim: int) -> nn.Module:
+        """A policy that has learned nothing: the policy prior anew, or with a memory another one beside it.
+
+        Args:
+            memory_dim: Entries of the memory; 0: none.
+
+        Returns:
+            The part that is new.
+
+        Raises:
+            ValueError: If there is a policy with a memory already.
+        """
+        if self.recurrent_policy is not None:
+            raise ValueError("The model has a policy with a memory; begin with a checkpoint without.")
+        hidden, device = int(self.sizes["mlp_dim"]), next(self.parameters()).device
+        if not memory_dim:
+            self.policy_head = mlp([self.latent_dim, hidden, hidden, 2 * self.action_dim]).to(device)
+            return self.policy_head
+        self.sizes["recurrent_dim"] = memory_dim
+        self.recurrent_policy = RecurrentPolicy(self.latent_dim, memory_dim, hidden, self.action_dim).to(device)
+        return self.recurrent_policy
 
     def add_residual(self, mlp_dim: int = 64) -> None:
         """Freeze the dynamics and add a trainable correction to its logits that starts at exactly zero.
@@ -269,3 +316,9 @@ class WorldModel(nn.Module):
         lines = [f"  {part:<12}{n:>12,}" for part, n in count.items() if n]
         total = sum(n for part, n in count.items() if part != "target_q")
         return "\n".join([f"WorldModel({total:,} parameters without targets)", *lines])
+
+
+def _moments(head: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean and log-deviation, each [..., A], of what a policy's last layer says, [..., 2 A]."""
+    mean, log_std = head.chunk(2, -1)
+    return mean, LOG_STD_MIN + 0.5 * (LOG_STD_MAX - LOG_STD_MIN) * (torch.tanh(log_std) + 1)

@@ -78,7 +78,8 @@ def make_env(
     with from_config("simulation"):
         how = {"threads": threads, "physics": cfg.physics, **noise, **reward}
         backend = SimBackend(task, num_envs, effects=present, draws=draws, **how)
-    return ControlEnv(backend, history=cfg.task.history)
+    known = backend.privileged if learning and cfg.train.privileged else None
+    return ControlEnv(backend, history=cfg.task.history, privileged=known)
 
 
 def draws_of(cfg: DictConfig) -> dict[str, randomize.Draw]:
@@ -167,12 +168,22 @@ def load_agent(cfg: DictConfig) -> tuple[Agent, dict[str, Any]]:
                 f"{path} was trained with task.{name}={loaded.meta[name]}, this run has {cfg.task[name]}. "
                 f"Leave task.{name} out, or pretrain again."
             )
+    if loaded.model.recurrent_policy is not None and (cfg.chosen.planner != "policy" or _learns(cfg)):
+        raise UserError(
+            f"{path} has a policy with a memory, which only planner=policy follows, and which nothing trains any "
+            "further. Use method=zero_shot planner=policy."
+        )
     torch.manual_seed(cfg.seed)  # of dropout, and of what a method adds to the model
     with from_config("train"):
         agent = instantiate(
             cfg.train.agent, model=loaded.model, seed=cfg.seed, device=device(cfg), discount=cfg.task.discount
         )
     return agent, loaded.meta
+
+
+def _learns(cfg: DictConfig) -> bool:
+    """Whether something trains what is loaded: pretraining, or a deployment's method."""
+    return cfg.command == "pretrain" or ("method" in cfg and cfg.method.get("updates", 0) > 0)
 
 
 def agents_of(cfg: DictConfig) -> str:

@@ -16,7 +16,7 @@ from mpc_sgft.runs import build
 from mpc_sgft.runs.collect import Act, collect, planner_policy, random_policy
 from planners.policy import PolicyPlanner
 
-POLICY = ("normalizer", "encoder", "policy_head")  # what acting takes of the model
+POLICY = ("normalizer", "encoder", "policy_head", "recurrent_policy")  # what acting takes of the model
 
 
 class Round(NamedTuple):

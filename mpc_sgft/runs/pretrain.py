@@ -34,7 +34,8 @@ def pretrain(cfg: DictConfig) -> int:
     judge = build.make_env(cfg, cfg.eval_episodes, randomised=True)
     agent = start_agent(cfg, judge)
     round_size = cfg.num_envs * judge.task.episode_steps
-    agent.imagined_steps = cfg.imagined_steps
+    if not cfg.train.privileged:
+        agent.imagined_steps = cfg.imagined_steps
     curriculum = build.make_curriculum(cfg)
     buffer = instantiate(cfg.train.replay, seed=cfg.seed, device=agent.device)
     state = {"round": 0, "updates": 0, "transitions": 0, "episodes": 0, "seconds": 0.0, "streak": 0, "unstable": 0}
@@ -98,7 +99,8 @@ def pretrain(cfg: DictConfig) -> int:
             collector.start(order)
         metrics: dict[str, float] = {"train_success": score(data).success, **widened}
         agent.scale_learning_rates(0.5 ** (state["transitions"] / cfg.lr_halves_every))
-        agent.hold_value(state["transitions"] <= cfg.hold_value)
+        if cfg.hold_value:
+            agent.hold_value(state["transitions"] <= cfg.hold_value)
         owed = int(state["transitions"] * cfg.updates_per_transition) - state["updates"]
         with watch("update"):
             for left in reversed(range(owed)):
@@ -166,13 +168,18 @@ def evaluation_seed(cfg: DictConfig) -> int:
 
 
 def start_agent(cfg: DictConfig, env: ControlEnv) -> Agent:
-    """A fresh agent, or that of `checkpoint=` to go on from with new data.
+    """A fresh agent, or that of `checkpoint=` to go on from with new data; of `train.privileged` always the latter.
 
     Raises:
         UserError: If the checkpoint does not fit, or was changed by a deployment.
     """
-    if cfg.checkpoint is None:
+    if cfg.checkpoint is None and not cfg.train.privileged:
         return build.make_agent(cfg, env)
+    if cfg.train.privileged and (cfg.imagined_steps or cfg.hold_value):
+        raise UserError(
+            f"imagined_steps={cfg.imagined_steps} and hold_value={cfg.hold_value} are for the world model, which "
+            f"train={cfg.chosen.train} leaves as it is. Leave them out."
+        )
     agent, meta = build.load_agent(cfg)
     build.check_fits(agent.model, env)
     changed = [part for part in ("command_map", "residual") if meta.get(part)]

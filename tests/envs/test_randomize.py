@@ -3,8 +3,11 @@
 import mujoco
 import numpy as np
 import pytest
+import torch
+from torchrl.envs.utils import check_env_specs
 
 from envs import randomize
+from envs.env import ControlEnv
 from envs.tasks import push
 
 N = 32
@@ -219,3 +222,26 @@ def test_observation_noise_falls_on_its_share_of_the_episodes(make_backend) -> N
 def test_draws_that_are_no_mapping_are_refused():
     with pytest.raises(ValueError, match="must map names to draws"):
         randomize.load([])  # type: ignore[arg-type]
+
+
+def test_what_only_the_simulator_knows_is_told_where_it_is_asked_for(make_backend) -> None:
+    backend = make_backend("push", 3, randomised=True)
+    backend.noise_sd, backend.noise_probability = 0.01, 1.0
+    plain = ControlEnv(backend, history=1)
+    assert "privileged" not in plain.reset().keys()
+    env = ControlEnv(backend, history=1, privileged=backend.privileged)
+    check_env_specs(env)
+    state = env.rollout(3)
+    told = torch.cat([state["privileged"], state["next", "privileged"][:, -1:]], 1)
+    seen = torch.cat([state["observation"], state["next", "observation"][:, -1:]], 1)[..., :4]
+    noise = seen - told[..., :4]
+    assert 0.005 < noise.std() < 0.015 and (noise != 0).all()
+    assert (told[..., 4:] == told[:, :1, 4:]).all(), "an episode has one model"
+    assert told[:, 0, 4:].unique().numel() == 12 and told[..., 4:].min() >= 0 and told[..., 4:].max() <= 1
+    backend.reset(np.arange(3))
+    backend.qpos[1] = np.nan
+    backend._check_physics()
+    known = backend.privileged()
+    assert (known[1] == 0).all() and np.isfinite(known).all() and (known[0] != 0).all()
+    np.testing.assert_array_equal(known[2, 4:], backend.randomizer.places[2])
+    np.testing.assert_array_equal(known[2, :4], backend.task.observe(backend.qpos, backend.qvel)[2])

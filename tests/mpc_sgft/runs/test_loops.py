@@ -14,7 +14,7 @@ import torch
 from omegaconf import OmegaConf
 from safetensors.torch import load_file
 
-from mpc_sgft import deploy
+from mpc_sgft import deploy, pretrain
 from mpc_sgft.command.errors import UserError
 from mpc_sgft.storage import checkpoint
 from mpc_sgft.storage.episode_file import read_episode
@@ -92,6 +92,26 @@ def test_widening_randomisation_resumes_with_the_same_numbers(tmp_path):
     assert ours == theirs
     drawn = [json.loads((folder / "summary.json").read_text())["randomize"] for folder in (whole, half)]
     assert drawn[0] == drawn[1] and drawn[0]
+
+
+def test_a_policy_with_a_memory_goes_on_after_a_stop_and_is_deployed_as_it_is(pretrained, tmp_path, capsys):
+    words, whole = ["train=recurrent_dr", "train.agent.memory_dim=8", "collector=inline"], tmp_path / "whole"
+    done = run("pretrain", f"run_dir={whole}", "transitions=640", f"checkpoint={pretrained}", *words)
+    assert done.returncode == 0, done.stderr
+    assert run("pretrain", "--resume", str(whole), "transitions=1280").returncode == 0
+    assert [r["updates"] for r in rows(whole)][-1] == "64" and float(rows(whole)[-1]["q_loss"]) > 0
+    found = checkpoint.load(whole / "checkpoint" / "model.safetensors").model
+    given = [f"checkpoint={whole}", f"run_dir={tmp_path / 'd'}", "rollouts=1"]
+    assert run("deploy", *given, "method=zero_shot", "planner=policy").returncode == 0
+    after = checkpoint.load(tmp_path / "d" / "checkpoint" / "model.safetensors").model
+    assert torch.equal(after.recurrent_policy.head[-1].weight, found.recurrent_policy.head[-1].weight)
+    for wrong in (["planner=policy"], ["method=zero_shot"]):  # sgft would train what does not act; a search ignores it
+        assert deploy.main(["--quiet", *TINY, *given[:1], f"run_dir={tmp_path / 'e'}", *wrong]) == 2
+        assert "only planner=policy follows" in capsys.readouterr().err
+    nothing, own = "which nothing trains any further", f"checkpoint={pretrained}"
+    for i, (wrong, says) in enumerate(((given[:1], nothing), ([own, "imagined_steps=3"], "leaves as it is"))):
+        assert pretrain.main(["--quiet", *TINY, *words, f"run_dir={tmp_path / str(i)}", *wrong]) == 2
+        assert says in capsys.readouterr().err
 
 
 def test_ctrl_c_saves_and_says_how_to_go_on(tmp_path):
