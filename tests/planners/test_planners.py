@@ -56,7 +56,8 @@ def test_a_plan_is_finite_within_limits_and_of_its_shape(random_model, z: Tensor
     assert plan.action.shape == (5, 2) and plan.mean.shape == plan.std.shape == (5, 4, 2)
     assert plan.candidates is not None and plan.candidate_values is not None
     assert plan.candidate_values.shape == plan.candidates.shape[:2]
-    assert all(x.isfinite().all() for x in plan)
+    assert plan.memory is None, "the model has no policy that remembers"
+    assert all(x.isfinite().all() for x in plan if x is not None)
     assert plan.action.abs().max() <= 1 and plan.mean.abs().max() <= 1 and plan.candidates.abs().max() <= 1
     assert_close(plan.value, h_step_return(model, z, plan.mean.unsqueeze(1), 0.99).squeeze(1))
     assert_close(plan.candidate_values, h_step_return(model, z, plan.candidates, 0.99))
@@ -76,7 +77,7 @@ def test_the_same_seed_gives_the_same_plan_bitwise(random_model, z: Tensor, name
     once = two_steps(3)
     torch.manual_seed(2)  # all randomness comes from the generator
     again = two_steps(3)
-    assert all(torch.equal(a, b) for a, b in zip(once, again, strict=True))
+    assert all(a is b or torch.equal(a, b) for a, b in zip(once, again, strict=True))
     assert not torch.equal(once.action, two_steps(4).action)
 
 
