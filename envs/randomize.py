@@ -94,6 +94,7 @@ class Randomizer:
     Attributes:
         places: Where in its range each simulation's last draws lie, 0 to 1, [N, D].
         shapes: Beta distributions to draw these places from, (a, b) each draw, [D, 2]; None: uniform.
+        given: Places to take instead of drawing, [N, D]; None: they are drawn.
 
     Raises:
         ValueError: For a field or a name that the model lacks, or a delay that its command history cannot hold.
@@ -103,6 +104,7 @@ class Randomizer:
         self.batch, self.draws = batch, draws
         self.places = np.full((sims, len(draws)), np.nan)
         self.shapes: NDArray | None = None
+        self.given: NDArray | None = None
         self.targets = [[_locate(model, field, d.at) for field in d.fields] for d in draws]
         names = {name for targets in self.targets for name, _, _ in targets}
         self.arrays = {name: batch.expand(name) for name in names}
@@ -114,11 +116,16 @@ class Randomizer:
     def draw(self, sims: list[int], rngs: list[np.random.Generator]) -> None:
         """Give each simulation in `sims` a model of its own, drawn with its own generator."""
         for sim, rng in zip(sims, rngs, strict=True):
-            self.places[sim] = rng.random(len(self.draws)) if self.shapes is None else rng.beta(*self.shapes.T)
+            self.places[sim] = self._places(sim, rng)
             values = [d.value(float(x)) for d, x in zip(self.draws, self.places[sim], strict=True)]
             self._write({name: array[sim] for name, array in self.arrays.items()}, values)
         if self.needs_constants and sims:
             self.batch.set_const(np.array(sims, np.int32))
+
+    def _places(self, sim: int, rng: np.random.Generator) -> NDArray:
+        if self.given is not None:
+            return self.given[sim]
+        return rng.random(len(self.draws)) if self.shapes is None else rng.beta(*self.shapes.T)
 
     def _write(self, model: dict[str, NDArray], values: list[float]) -> None:
         """Write the nominal model with `values`, one each draw, into one simulation's fields."""

@@ -22,7 +22,9 @@ from mpc_sgft.learning.beta import quantile
 from mpc_sgft.learning.observation_map import Sensed
 from mpc_sgft.learning.world_model import WorldModel
 from mpc_sgft.storage import checkpoint
+from planners.exploring import ExploringPlanner
 from planners.malloc import keep_freed_memory
+from planners.policy import PolicyPlanner
 
 if TYPE_CHECKING:
     from mpc_sgft.learning.doraemon import Doraemon  # only where it is asked for: its solver takes time to import
@@ -133,6 +135,21 @@ def make_planner(cfg: DictConfig, action_dim: int):
     """
     with from_config("planner"):
         return instantiate(cfg.planner, action_dim=action_dim, discount=cfg.task.discount, _convert_="all")
+
+
+def make_warm_up(cfg: DictConfig, env: ControlEnv) -> PolicyPlanner | ExploringPlanner:
+    """What drives the first real rollouts: the policy prior, pushed as `cfg.exploration` says.
+
+    Raises:
+        UserError: For offsets that do not fit the task.
+    """
+    how = {"action_dim": env.action_dim, "horizon": cfg.planner.horizon, "discount": cfg.task.discount}
+    pushes = OmegaConf.to_container(cfg.exploration, resolve=True) if "exploration" in cfg else {}
+    assert isinstance(pushes, dict)
+    if not pushes.get("offsets"):  # deployments of before, which --retrain repeats, say nothing of it
+        return PolicyPlanner(**how)
+    with from_config("exploration"):
+        return ExploringPlanner(**how, **pushes, steps=env.task.episode_steps)  # type: ignore[arg-type]
 
 
 def make_agent(cfg: DictConfig, env: ControlEnv) -> Agent:

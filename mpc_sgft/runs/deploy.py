@@ -32,7 +32,6 @@ from mpc_sgft.storage.episode_file import read_episode
 from mpc_sgft.storage.metrics import GrowingTable, MetricLogger, progress
 from mpc_sgft.storage.rollout import Rollout, from_episode
 from mpc_sgft.views.deploy_view import DeployViewer
-from planners.policy import PolicyPlanner
 
 
 def deploy(cfg: DictConfig) -> int:
@@ -100,6 +99,7 @@ class Deployment:
         (self.folder / "episodes").mkdir(exist_ok=True)
         build.prepare_process(cfg)
         self.planner = build.make_planner(cfg, env.action_dim)
+        self.warm_up = build.make_warm_up(cfg, env)
         self.transfer = make_transfer(cfg, agent, build.sensed(cfg), env.task.episode_steps)
         self.frozen = agent.frozen_hash()
         self.state: dict[str, Any] = {"rollouts": 0, "aborted": 0, "scores": {}, "seconds": 0.0, "successes": 0}
@@ -199,9 +199,7 @@ class Deployment:
             path.rename(path.with_suffix(".empty.mcap"))  # the robot never moved
         planner = self.planner
         if number <= cfg.warmup:
-            planner = PolicyPlanner(
-                action_dim=self.env.action_dim, horizon=cfg.planner.horizon, discount=cfg.task.discount
-            )
+            planner = self.warm_up
         model = self.transfer.pretrained if number <= cfg.warmup else self.transfer.acting
         seed = start_seed(cfg.seed, number)
         self.operator.enter("resetting", number - 1)

@@ -7,7 +7,8 @@ Each gap and seed has a folder under --runs; a first deployment or a comparison 
 is known to the two deployments alone. `--curves` writes what came of it as `tools.studies.benchmark --with` takes it
 in: success before, and what the agent that was trained again reaches before it learns from anything real itself. With
 `--effects` only those are looked for, as where one thinks beforehand of what may differ; with `--ranges` nothing is
-named, and ranges of the randomisation are found instead, which is the method `dropo`.
+named, and ranges of the randomisation are found instead, which is the method `dropo`; with `--explore` besides all
+real rollouts are driven so that they tell more of these ranges, which is `asid`.
 """
 
 import argparse
@@ -16,7 +17,11 @@ from pathlib import Path
 
 import yaml
 
+from mpc_sgft.command.compose import compose
 from mpc_sgft.diagnose.__main__ import main as diagnose
+from mpc_sgft.runs import build
+from mpc_sgft.runs.exploration import explore
+from tools import asid
 from tools.studies.runner import finished, write
 from tools.studies.study import COLUMNS as CURVE
 
@@ -45,13 +50,16 @@ def main() -> None:
     parser.add_argument("--set", nargs="*", default=[], metavar="name=value", help="overrides of the deployments")
     parser.add_argument("--effects", metavar="A,B", help="look for these alone")
     parser.add_argument("--ranges", metavar="RANDOMIZE", help="find ranges of this randomisation, and name nothing")
+    parser.add_argument("--explore", action="store_true", help="with --ranges: drive as tools.asid says")
     parser.add_argument("--curves", type=Path, metavar="CSV", help="success before and after, as a method of its own")
     parser.add_argument("--runs", type=Path, default=Path("runs/close_the_loop"))
     args = parser.parse_args()
+    if args.explore and not args.ranges:
+        parser.error("--explore goes with --ranges: what is to be found tells how to drive")
     how = ["--retrain", "--retrain-transitions", str(args.transitions)]
     how += ["--effects", args.effects] if args.effects else []
     how += ["--ranges", args.ranges] if args.ranges else []
-    folder, variant = "diagnosis", ""
+    folder, variant, beginning = "diagnosis", "", "asid-" if args.explore else ""
     if args.effects:
         variant = f"effects={args.effects}"
     if args.ranges:
@@ -59,11 +67,13 @@ def main() -> None:
     rows, curves = [], []
     for gap in args.gaps:
         for seed in args.seeds:
-            run = args.runs / f"{gap}-{seed}"
-            rows.append(one(gap, seed, run, run / folder, args.set, how))
+            run = args.runs / f"{beginning}{gap}-{seed}"
+            new = args.explore and not (run / "config.yaml").exists()
+            words = [*args.set, *(exploring(seed, args.ranges, args.set) if new else [])]
+            rows.append(one(gap, seed, run, run / folder, words, how))
             write(args.csv, COLUMNS, rows)
             if args.curves:
-                curves += curve(rows[-1], run, run / folder, variant)
+                curves += curve(rows[-1], run, run / folder, variant, explored=args.explore)
                 write(args.curves, CURVE, curves)
 
 
@@ -90,6 +100,14 @@ def one(gap: str, seed: int, run: Path, found: Path, overrides: list[str], how: 
     return row
 
 
+def exploring(seed: int, ranges: str, overrides: list[str]) -> list[str]:
+    """Overrides of a deployment all of whose rollouts are driven to tell of a randomisation's draws."""
+    own = [text for text in overrides if text.startswith(("task=", "task.", "checkpoint="))]
+    cfg = compose("pretrain", [*own, f"randomize={ranges}"], [])
+    agent, _ = build.load_agent(cfg)
+    return asid.overrides(explore(cfg, agent.model, seed=seed), "${rollouts}")
+
+
 def named(found: Path) -> dict[str, object]:
     """What a diagnosis says, of effects or of ranges."""
     if (found / "ranges.yaml").exists():
@@ -105,7 +123,9 @@ def named_nothing(report: Path) -> bool:
     return report.exists() and not json.loads(report.read_text())["effects"]
 
 
-def curve(row: dict[str, object], run: Path, found: Path, variant: str) -> list[dict[str, object]]:
+def curve(
+    row: dict[str, object], run: Path, found: Path, variant: str, explored: bool = False
+) -> list[dict[str, object]]:
     """The rows of a learning curve: before, and after the real rollouts that were diagnosed.
 
     Where nothing was named nothing is trained again, and the agent stays as it was.
@@ -113,7 +133,7 @@ def curve(row: dict[str, object], run: Path, found: Path, variant: str) -> list[
     summary = json.loads((run / "summary.json").read_text())
     again = found / "deploy" / "summary.json"
     after = json.loads(again.read_text()) if "zero_shot_after" in row else summary
-    method = "dropo" if row["verdict"] == "ranges" else "identify"
+    method = "asid" if explored else "dropo" if row["verdict"] == "ranges" else "identify"
     known = {"gap": row["gap"], "method": method, "variant": variant}
     known |= {"seed": row["seed"], "episodes": summary["evaluation_episodes"]}
     return [

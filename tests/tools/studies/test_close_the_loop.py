@@ -5,7 +5,10 @@ import json
 from pathlib import Path
 
 import pytest
+import torch
 
+from mpc_sgft.command.compose import compose
+from mpc_sgft.runs.exploration import Exploration
 from tools.studies import close_the_loop
 from tools.studies.runner import read_curves
 
@@ -41,18 +44,30 @@ def test_what_was_measured_is_written_and_nothing_runs_again(tmp_path: Path, mon
     assert successes == {0: ["0.1", "0.9"], 1: ["0.1", "0.1"]}  # who names nothing trains nothing again
 
 
-def test_ranges_are_a_method_of_their_own_beside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    run = tmp_path / "runs" / "turned-0"
+@pytest.mark.parametrize(("method", "more"), [("dropo", []), ("asid", ["--explore"])])
+def test_ranges_are_a_method_of_their_own_beside(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, method: str, more: list[str]
+) -> None:
+    run = tmp_path / "runs" / f"{'asid-' * len(more)}turned-0"
     deployment(run, 0.1)
+    (run / "config.yaml").touch()
     deployment(run / "ranges" / "deploy", 0.7)
     outcome = {"zero_shot_success": 0.7, "final_success": 0.7, "rollouts_to_95": None}
     both = {"transitions": 60000, "before": outcome | {"zero_shot_success": 0.1}, "after": outcome}
     (run / "ranges" / "retrain.json").write_text(json.dumps(both))
     (run / "ranges" / "ranges.yaml").write_text("draws: {mass: {low: 1.5, high: 1.7}}")
     words = ["loop", str(tmp_path / "loop.csv"), "--gaps", "turned", "--seeds", "0", "--runs", f"{tmp_path}/runs"]
-    monkeypatch.setattr("sys.argv", [*words, "--ranges", "push", "--curves", str(tmp_path / "curves.csv")])
+    monkeypatch.setattr("sys.argv", [*words, *more, "--ranges", "push", "--curves", str(tmp_path / "curves.csv")])
     close_the_loop.main()
     (row,) = csv.DictReader((tmp_path / "loop.csv").open())
     assert (row["verdict"], row["found"], row["zero_shot_after"]) == ("ranges", "mass 1.5 to 1.7", "0.7")
     seeds = read_curves([tmp_path / "curves.csv"])["turned"]
-    assert set(seeds) == {"dropo ranges=push"}
+    assert set(seeds) == {f"{method} ranges=push"}
+
+
+def test_who_explores_drives_every_rollout_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = Exploration(0.5, torch.tensor([[0.25, -1.0]]), torch.ones(4), torch.ones(4))
+    monkeypatch.setattr(close_the_loop, "explore", lambda cfg, model, seed: found)
+    words = close_the_loop.exploring(3, "push", ["gap=turned", "rollouts=7"])
+    made = compose("deploy", ["rollouts=7", *words], [])
+    assert made.warmup == 7 and made.exploration == {"weight": 0.5, "offsets": [[0.25, -1.0]]}
