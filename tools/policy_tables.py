@@ -86,7 +86,13 @@ def benchmark() -> str:
         seconds, updates = (median(float(row[name]) for row in own) for name in ("seconds", "updates"))
         cost.append([f"`{method}`", own[0]["rollouts"], f"{updates:.0f}", f"{seconds:.0f}"])
     head = ["method", "real rollouts", "updates", "seconds, median"]
-    return "\n\n".join([*parts, "What a run costs:", table(head, cost)])
+    parts += ["What a run costs:", table(head, cost)]
+    roped = curves(read("benchmark/rope.csv"), lambda row: f"`{row['method']}`", "method")
+    parts.append(f"In `rope_real`, two seeds:\n\n{roped}")
+    alone = {"method": "method", "gap": "gap", "seed": "seed", "in its simulation": ("sim_success", percent)}
+    alone |= {"success": ("success", percent), "low": ("low", percent), "high": ("high", percent)}
+    parts.append(f"Policies that simulation alone has trained:\n\n{pick(read('benchmark/zero_shot.csv'), alone)}")
+    return "\n\n".join(parts)
 
 
 def mean_of(row: Row) -> str:
