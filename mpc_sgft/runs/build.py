@@ -167,8 +167,10 @@ def load_agent(cfg: DictConfig) -> tuple[Agent, dict[str, Any]]:
 
     Raises:
         UserError: If the checkpoint is missing, corrupt, of another task, or of another size than a `model=` that was
-            asked for.
+            asked for; if its policy has a memory that nothing here follows; or if `train=` would begin it anew.
     """
+    if cfg.train.get("privileged") and cfg.command != "pretrain":
+        raise UserError(f"train={cfg.chosen.train} begins a policy anew: it is for pretrain. Leave it out here.")
     path = cfg.checkpoint if cfg.checkpoint is not None else shipped(agents_of(cfg))
     tasks = [cfg.chosen.task, agents_of(cfg)]
     asked = any(text.startswith("model") for text in cfg.overrides)

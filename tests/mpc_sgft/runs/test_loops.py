@@ -222,6 +222,7 @@ def test_the_scripted_pendulum_swings_up(tmp_path):
         (["gap.effects.actuator_gain.gian=0.5"], "gain"),
         (["planner.num_elites=100000"], "num_elites"),
         (["model=5M"], "latent_dim"),
+        (["train=recurrent_dr"], "train=recurrent_dr begins a policy anew"),
     ],
 )
 def test_bad_input_is_one_clear_line(pretrained, tmp_path, capsys, words, says):
