@@ -56,15 +56,20 @@ class PolicyPlanner:
         checks.note("latents", z)
         shape = (len(z), self.horizon, self.action_dim)
         noise = torch.randn(shape, generator=generator, device=z.device, dtype=z.dtype) if explore else None
-        if getattr(model, "recurrent_policy", None) is None:
-            memory, (latents, mean) = None, imagine_policy(model, z, noise, self.horizon)
-        else:
-            begins = torch.zeros(len(z), dtype=torch.bool, device=z.device) if fresh is None else fresh
-            before = None if previous is None else previous.memory
-            latents, mean, memory = imagine_recurrent(model, z, before, begins, noise, self.horizon)  # type: ignore
+        latents, mean, memory = self._followed(model, z, previous, fresh, noise)
         checks.note_followed(latents, mean)
         value = imagined_return(model, latents, mean, self.discount)
         checks.note("values of the plan", value)
-        check_finite("PolicyPlanner", checks.names, checks.stacked())
+        check_finite(type(self).__name__, checks.names, checks.stacked())
         kept = (mean.unsqueeze(1), value.unsqueeze(1)) if keep_candidates else (None, None)
         return Plan(mean[:, 0], mean, torch.zeros_like(mean), value, *kept, memory=memory)
+
+    def _followed(
+        self, model: Model, z: Tensor, previous: Plan | None, fresh: Tensor | None, noise: Tensor | None
+    ) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Latents [B, H + 1, D] and actions [B, H, A] from z on, and what `Plan.memory` keeps after the first step."""
+        if getattr(model, "recurrent_policy", None) is None:
+            return *imagine_policy(model, z, noise, self.horizon), None
+        begins = torch.zeros(len(z), dtype=torch.bool, device=z.device) if fresh is None else fresh
+        before = None if previous is None else previous.memory
+        return imagine_recurrent(model, z, before, begins, noise, self.horizon)  # type: ignore[arg-type]

@@ -88,7 +88,7 @@ def benchmark() -> str:
     head = ["method", "real rollouts", "updates", "seconds, median"]
     parts += ["What a run costs:", table(head, cost)]
     roped = curves(read("benchmark/rope.csv"), lambda row: f"`{row['method']}`", "method")
-    parts.append(f"In `rope_real`, two seeds:\n\n{roped}")
+    parts.append(f"In `rope_real`:\n\n{roped}")
     alone = {"method": "method", "gap": "gap", "seed": "seed", "in its simulation": ("sim_success", percent)}
     alone |= {"success": ("success", percent), "low": ("low", percent), "high": ("high", percent)}
     parts.append(f"Policies that simulation alone has trained:\n\n{pick(read('benchmark/zero_shot.csv'), alone)}")

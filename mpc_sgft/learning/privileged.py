@@ -127,16 +127,15 @@ class PrivilegedActorCritic:
         logits = self.critics(torch.cat([z[:, :-1], known, batch["action"]], -1))  # [2, B, T, bins]
         loss = losses.two_hot_loss(logits, model.two_hot.encode(target).expand_as(logits))
         metrics = {"q_loss": _mean(loss, counts)}
-        self._descend("critics", metrics)
+        self._descend("critics", metrics["q_loss"])
         if self.updates % self.policy_delay == 0:
             action, log_prob = (x[:, :-1] for x in self._act(z, begins))
             worth = self._worth(self.critics, z[:, :-1], known, action)
-            loss = losses.policy_loss(worth, log_prob, coef, self.scale.value)
-            policy = {"policy_loss": _mean(loss, counts)}
-            self._descend("policy", policy)
-            entropy = {"entropy_loss": losses.entropy_coef_loss(self.log_entropy_coef, log_prob, -model.action_dim)}
-            self._descend("entropy", entropy)
-            metrics |= policy | {"entropy": -log_prob.mean(), "entropy_coef": coef}
+            loss = _mean(losses.policy_loss(worth, log_prob, coef, self.scale.value), counts)
+            self._descend("policy", loss)
+            wanted = -float(model.action_dim)
+            self._descend("entropy", losses.entropy_coef_loss(self.log_entropy_coef, log_prob, wanted))
+            metrics |= {"policy_loss": loss, "entropy": -log_prob.mean(), "entropy_coef": coef}
         for there, here in zip(self.targets.parameters(), self.critics.parameters(), strict=True):
             there.data.lerp_(here.data, self.target_rate)
         self._averaged.follow(model)
@@ -184,12 +183,12 @@ class PrivilegedActorCritic:
         """Q of both critics, [2, B, T]."""
         return self.model.two_hot.decode(critics(torch.cat([z, known, action], -1)))
 
-    def _descend(self, name: str, loss: Mapping[str, Tensor]) -> None:
-        """A step of one optimiser down the one loss."""
-        check_finite(loss)
+    def _descend(self, name: str, loss: Tensor) -> None:
+        """A step of one optimiser down its loss."""
+        check_finite({f"loss of the {name}": loss})
         parameters = self.optimizers[name].param_groups[0]["params"]
         self.optimizers[name].zero_grad()
-        sum(loss.values(), start=torch.zeros((), device=self.device)).backward(inputs=parameters)
+        loss.backward(inputs=parameters)
         nn.utils.clip_grad_norm_(parameters, self.grad_clip, foreach=True)
         self.optimizers[name].step()
 

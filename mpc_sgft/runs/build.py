@@ -141,13 +141,19 @@ def make_warm_up(cfg: DictConfig, env: ControlEnv) -> PolicyPlanner | ExploringP
     """What drives the first real rollouts: the policy prior, pushed as `cfg.exploration` says.
 
     Raises:
-        UserError: For offsets that do not fit the task.
+        UserError: For offsets that do not fit the task, or that would not be driven.
     """
     how = {"action_dim": env.action_dim, "horizon": cfg.planner.horizon, "discount": cfg.task.discount}
     pushes = OmegaConf.to_container(cfg.exploration, resolve=True) if "exploration" in cfg else {}
     assert isinstance(pushes, dict)
     if not pushes.get("offsets"):  # deployments of before, which --retrain repeats, say nothing of it
+        if pushes.get("weight", 1.0) != 1.0:
+            raise UserError(
+                f"exploration.weight={pushes['weight']} goes with exploration.offsets. Give them, or neither."
+            )
         return PolicyPlanner(**how)
+    if cfg.warmup < 1:
+        raise UserError("exploration.offsets drive the warm-up, and warmup=0. Give warmup=N, the rollouts driven so.")
     with from_config("exploration"):
         return ExploringPlanner(**how, **pushes, steps=env.task.episode_steps)  # type: ignore[arg-type]
 
@@ -187,10 +193,11 @@ def load_agent(cfg: DictConfig) -> tuple[Agent, dict[str, Any]]:
                 f"{path} was trained with task.{name}={loaded.meta[name]}, this run has {cfg.task[name]}. "
                 f"Leave task.{name} out, or pretrain again."
             )
-    if loaded.model.recurrent_policy is not None and (cfg.chosen.planner != "policy" or _learns(cfg)):
+    pushed = OmegaConf.select(cfg, "exploration.offsets")
+    if loaded.model.recurrent_policy is not None and (cfg.chosen.planner != "policy" or _learns(cfg) or pushed):
         raise UserError(
             f"{path} has a policy with a memory, which only planner=policy follows, and which nothing trains any "
-            "further. Use method=zero_shot planner=policy."
+            "further. Use method=zero_shot planner=policy, without exploration."
         )
     torch.manual_seed(cfg.seed)  # of dropout, and of what a method adds to the model
     with from_config("train"):

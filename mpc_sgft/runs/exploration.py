@@ -24,6 +24,7 @@ from omegaconf import DictConfig
 from torch import Tensor
 
 from envs.env import ControlEnv
+from mpc_sgft.command.errors import UserError
 from mpc_sgft.learning.world_model import WorldModel
 from mpc_sgft.runs import build
 from planners.exploring import offset_at, pushed
@@ -40,8 +41,8 @@ class Exploration(NamedTuple):
     Attributes:
         weight: Of the policy prior.
         offsets: Knots of the offsets, [K, A].
-        left: Standard deviation expected to be left of each draw's place after one rollout, [D]; 0.29 is what was
-            there before.
+        left: Standard deviation expected to be left of each draw's place after one rollout, [D], in episodes that did
+            not choose the offsets; 0.29 is what was there before.
         plain: The same of the policy prior alone.
     """
 
@@ -78,31 +79,40 @@ def explore(
         UserError: If nothing is drawn, or the model does not fit the task.
     """
     draws = len(cfg.randomize.draws)
+    if not draws:
+        raise UserError(
+            f"randomize={cfg.chosen.randomize} draws nothing, so there is nothing to learn. Give another one."
+        )
     env = build.make_env(cfg, proposals * starts * (1 + 2 * draws), randomised=True)
     build.check_fits(model, env)
     generator = torch.Generator().manual_seed(seed)
     size = knots * env.action_dim
     mean, sd = torch.zeros(size + 1), torch.full((size + 1,), 0.5)
     mean[-1] = 1.0  # the weight of the policy prior
-    best, least, plain = mean, torch.inf, None
+    best = mean
     with closing(env.backend):
         noise = max(env.backend.noise_sd, STILL)
         env.backend.noise_sd = 0.0
+
+        def left(drawn: Tensor, number: int) -> Tensor:
+            """Variance that each driver leaves of each place in the starts of a round, [M, D]."""
+            pushes = drawn[:, :-1].view(proposals, knots, -1)
+            found = information(env, model, drawn[:, -1], pushes, draws, seed * (rounds + 1) + number, noise)
+            return torch.linalg.inv(found + UNIFORM * torch.eye(draws)).diagonal(dim1=-2, dim2=-1)
+
         for number in track(range(rounds)):
             drawn = mean + sd * torch.randn(proposals, size + 1, generator=generator)
             drawn[0], drawn[0, -1], drawn[1] = 0.0, 1.0, best
             drawn[:, -1].clamp_(0, 1)
             drawn[:, :-1].clamp_(-2, 2)
-            pushes = drawn[:, :-1].view(proposals, knots, -1)
-            found = information(env, model, drawn[:, -1], pushes, draws, seed * rounds + number, noise)
-            left = torch.linalg.inv(found + UNIFORM * torch.eye(draws)).diagonal(dim1=-2, dim2=-1)  # [M, D]
-            order = left.sum(1).argsort()
+            order = left(drawn, number).sum(1).argsort()
             elites = drawn[order[: max(2, int(ELITES * proposals))]]
             mean, sd = elites.mean(0), elites.std(0) + 0.02
-            best, least = drawn[order[0]], left[order[0]]
-            plain = left[0]
-    assert plain is not None and isinstance(least, Tensor)
-    return Exploration(float(best[-1]), best[:-1].view(knots, -1), least.sqrt(), plain.sqrt())
+            best = drawn[order[0]]
+        drawn = best.repeat(proposals, 1)
+        drawn[0], drawn[0, -1] = 0.0, 1.0
+        plain, found = left(drawn, rounds)[:2].sqrt()  # in starts and draws that chose nothing
+    return Exploration(float(best[-1]), best[:-1].view(knots, -1), found, plain)
 
 
 @torch.no_grad()

@@ -134,10 +134,13 @@ def pretrain(cfg: DictConfig) -> int:
     final_judge = build.make_env(cfg, cfg.final_episodes, randomised=True)
     planner = build.make_planner(cfg, judge.action_dim)
     torch.set_num_threads(max(cfg.torch_threads, cores()))  # nothing else works now
-    policies = prior(agent), planner_policy(agent.averaged, planner, cfg.seed)
+    policies = [prior(agent)]
+    if cfg.chosen.planner != "policy":
+        policies.append(planner_policy(agent.averaged, planner, cfg.seed))
     steps = len(policies) * final_judge.task.episode_steps
     with watch("evaluate"), progress(steps, desc="evaluate", disable=cfg.quiet) as bar:
-        final, planned = (score(collect(final_judge, shown(act, bar), seed=EVAL_SEED + 1)) for act in policies)
+        scores = [score(collect(final_judge, shown(act, bar), seed=EVAL_SEED + 1)) for act in policies]
+    final, planned = scores[0], scores[-1]
     torch.set_num_threads(cfg.torch_threads)
     summary = {
         "task": cfg.chosen.task,

@@ -8,8 +8,8 @@
     asymmetric_ac   critics that know the draws, a policy without a memory (`train=asymmetric_ac`)
     recurrent_dr    such critics, a policy with a memory (`train=recurrent_dr`)
 
-Each is trained first, ten minutes to half an hour a seed on one core, in a folder of --runs; one that is there is not
-trained again. All are measured in the same episodes, those of a deployment's evaluations.
+Each is trained first, in a folder of --runs; one that is there is not trained again. All are measured in the same
+episodes, those of a deployment's evaluations.
 """
 
 import argparse

@@ -8,6 +8,7 @@ from mpc_sgft.command.compose import compose
 from mpc_sgft.command.errors import UserError
 from mpc_sgft.runs import build
 from mpc_sgft.runs.exploration import STEP, explore, information
+from mpc_sgft.storage import checkpoint
 from planners.exploring import ExploringPlanner, offset_at
 from planners.policy import PolicyPlanner
 from tools import asid
@@ -76,10 +77,27 @@ def test_what_is_found_tells_more_than_the_policy_alone() -> None:
     plain = compose("deploy", ["task=pendulum"], [])
     assert isinstance(build.make_warm_up(plain, build.make_env(plain, 1)), PolicyPlanner)
     wrong = compose("deploy", ["task=pendulum", "exploration.offsets=[[0.1,0.2]]"], [])
+    with pytest.raises(UserError, match="warmup=0"):
+        build.make_warm_up(wrong, build.make_env(wrong, 1))
+    wrong.warmup = 1
     with pytest.raises(UserError, match="1 numbers each"):
+        build.make_warm_up(wrong, build.make_env(wrong, 1))
+    wrong.exploration = {"weight": 0.5, "offsets": []}
+    with pytest.raises(UserError, match="goes with exploration.offsets"):
         build.make_warm_up(wrong, build.make_env(wrong, 1))
 
 
-def test_the_command_prints_words_for_deploy(capsys) -> None:
+def test_the_command_prints_words_for_deploy(capsys, tmp_path) -> None:
+    cfg = compose("pretrain", ["task=pendulum"], [])
+    model = build.make_agent(cfg, build.make_env(cfg, 1)).model
+    checkpoint.save(tmp_path / "a.safetensors", model, checkpoint.describe(cfg, model))
+    words = ["--task", "pendulum", "--checkpoint", str(tmp_path / "a.safetensors"), "--rounds", "1", "--quiet"]
+    assert asid.main([*words, "--rollouts", "3"]) == 0
+    *told, line = capsys.readouterr().out.splitlines()
+    assert [text.split(":")[0] for text in told] == ["# mass", "# damping"]
+    made = compose("deploy", ["task=pendulum", *line.split()], [])
+    assert made.warmup == 3 and len(made.exploration.offsets) == 8
+    assert asid.main([*words, "--randomize", "none"]) == 2
+    assert "draws nothing" in capsys.readouterr().err
     assert asid.main(["--task", "pendulum", "--checkpoint", "nowhere", "--quiet"]) == 2
     assert "nowhere" in capsys.readouterr().err

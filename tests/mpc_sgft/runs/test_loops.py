@@ -105,7 +105,9 @@ def test_a_policy_with_a_memory_goes_on_after_a_stop_and_is_deployed_as_it_is(pr
     assert run("deploy", *given, "method=zero_shot", "planner=policy").returncode == 0
     after = checkpoint.load(tmp_path / "d" / "checkpoint" / "model.safetensors").model
     assert torch.equal(after.recurrent_policy.head[-1].weight, found.recurrent_policy.head[-1].weight)
-    for wrong in (["planner=policy"], ["method=zero_shot"]):  # sgft would train what does not act; a search ignores it
+    frozen, alone = "method=zero_shot", "planner=policy"  # sgft would train what does not act; a search ignores it
+    pushed = [frozen, alone, "warmup=1", "exploration.offsets=[[0.1]]"]  # the policy prior
+    for wrong in ([alone], [frozen], pushed):
         assert deploy.main(["--quiet", *TINY, *given[:1], f"run_dir={tmp_path / 'e'}", *wrong]) == 2
         assert "only planner=policy follows" in capsys.readouterr().err
     nothing, own = "which nothing trains any further", f"checkpoint={pretrained}"
