@@ -69,6 +69,12 @@ def test_help_lists_the_names_and_loads_nothing_heavy(name: str, tmp_path: Path)
     assert all(effect in done.stdout for effect in choices.effects())
 
 
+def test_a_deployment_starts_without_what_few_runs_need() -> None:
+    code = "import sys, mpc_sgft.runs.deploy\nprint('LOADED', sorted({'scipy', 'matplotlib', 'plotly'} & {*sys.modules}))"
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=120)
+    assert "LOADED []" in done.stdout, done.stderr
+
+
 def test_groups_and_effects_are_the_files_on_disk() -> None:
     assert {"task", "gap", "planner", "model", "backend", "experiment"} <= set(choices.groups())
     assert "none" in choices.groups()["gap"]

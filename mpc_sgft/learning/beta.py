@@ -1,7 +1,6 @@
 """Beta distributions over the ranges of the randomisation's draws."""
 
 import torch
-from scipy.special import betaincinv
 from torch import Tensor
 from torch.distributions import Beta
 
@@ -16,4 +15,6 @@ def beta(x: Tensor) -> Beta:
 
 def quantile(shapes: Tensor, share: Tensor) -> Tensor:
     """Below which shares [..., D] of Beta distributions (a, b) [D, 2] lie, [..., D]."""
+    from scipy.special import betaincinv  # late: no start waits for it that has no such distribution
+
     return torch.from_numpy(betaincinv(*shapes.T.numpy(), share.numpy()))
