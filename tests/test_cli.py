@@ -70,7 +70,9 @@ def test_help_lists_the_names_and_loads_nothing_heavy(name: str, tmp_path: Path)
 
 
 def test_a_deployment_starts_without_what_few_runs_need() -> None:
-    code = "import sys, mpc_sgft.runs.deploy\nprint('LOADED', sorted({'scipy', 'matplotlib', 'plotly'} & {*sys.modules}))"
+    code = (
+        "import sys, mpc_sgft.runs.deploy\nprint('LOADED', sorted({'scipy', 'matplotlib', 'plotly'} & {*sys.modules}))"
+    )
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=120)
     assert "LOADED []" in done.stdout, done.stderr
 

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from envs.backends.base import Outcome
 from envs.backends.friction import LoadFriction
-from envs.effects.backlash import place_rotors
 from envs.effects.base import Effect
+from envs.effects.rotor import place_rotors
 from envs.randomize import Draw, Randomizer
 from envs.task import AbstractTask, Array, whole_steps
 

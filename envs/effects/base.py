@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from envs.task import AbstractTask
 
 Array = NDArray[np.float64]
-ROTOR = "backlash/"  # names of the joints that the effect backlash adds begin so
+ROTOR = "rotor/"  # names of the joints that backlash and flexible_joint add begin so
 
 
 @dataclass(frozen=True)
@@ -117,7 +117,7 @@ class Effect:
 def available() -> tuple[str, ...]:
     """Names of the effects, which are the names of the files in this folder."""
     here = sys.modules["envs.effects"].__path__
-    return tuple(sorted(m.name for m in pkgutil.iter_modules(here) if m.name not in ("base", "passive")))
+    return tuple(sorted(m.name for m in pkgutil.iter_modules(here) if m.name not in ("base", "passive", "rotor")))
 
 
 Parameters = Mapping[str, Any] | None
@@ -173,7 +173,7 @@ def per_axis(value: float | tuple[float, ...], size: int, what: str) -> Array:
 def pick(elements: list[Any], at: tuple[str, ...], kind: str) -> list[Any]:
     """The scene's elements with the names in `at`, or all of them if `at` is empty.
 
-    "All" are those of the machine itself: no rotors that the effect backlash added, and never an actuator without an
+    "All" are those of the machine itself: no rotors that another effect added, and never an actuator without an
     input, which is how other effects enter a scene.
 
     Raises:

@@ -27,5 +27,5 @@ def groups_of(command: str) -> dict[str, list[str]]:
 
 def effects() -> list[str]:
     """Names of the effects in envs/effects/, sorted."""
-    shared = ("base", "passive")  # what the effects are made of
+    shared = ("base", "passive", "rotor")  # what the effects are made of
     return sorted(p.stem for p in EFFECT_DIR.glob("*.py") if not p.stem.startswith("_") and p.stem not in shared)

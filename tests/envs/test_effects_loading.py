@@ -16,7 +16,8 @@ def test_the_folder_holds_what_the_project_promises() -> None:
         "actuator_gain actuator_offset actuator_delay actuator_lag viscous_friction coulomb_friction payload "
         "contact_friction sensor_offset sensor_noise sensor_delay frame_rotation state_torque asymmetric_friction "
         "stribeck_friction load_dependent_friction quadratic_drag armature torque_saturation deadband backlash "
-        "joint_stiffness gravity_tilt contact_softness sensor_gain directional_gain local_gain rope_length"
+        "flexible_joint joint_stiffness gravity_tilt contact_softness sensor_gain directional_gain local_gain "
+        "rope_length"
     )
     assert set(promised.split()) <= set(NAMES)
 

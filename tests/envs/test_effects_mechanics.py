@@ -124,6 +124,65 @@ def test_a_joint_that_nothing_drives_has_no_play(build) -> None:
         build(PLAIN, {"backlash": {"gap": 0.1, "inertia": 9.0}})
 
 
+def _edited(scene: str, *gaps: dict) -> mujoco.MjModel:
+    spec = mujoco.MjSpec.from_string(scene)
+    for gap in gaps:
+        for effect in effects.load(gap):
+            effect.edit_spec(spec)
+    return spec.compile()
+
+
+@pytest.mark.parametrize(("armature", "given"), [(0.4, 0.0), (0.0, 0.4), (0.0, 0.0)])
+def test_an_elastic_drive_is_two_masses_and_a_spring(build, simulate, armature, given) -> None:
+    """From rest under a constant force: the centre of both moves as one mass, and they swing against each other."""
+    force, stiffness = 3.0, 400.0
+    rotor, whole = armature or given or 0.05 * MASS, MASS + armature
+    gap = {"flexible_joint": {"compliance": 1 / stiffness, "damping_ratio": 0.0, "inertia": given}}
+    q, _ = simulate(build(SLIDE.replace("ARMATURE", f'armature="{armature}"'), gap), np.full((1500, 1), force))
+    t = STEP * np.arange(1, 1501)
+    reduced = rotor * (whole - rotor) / whole
+    twist = force * reduced / (rotor * stiffness) * (1 - np.cos(np.sqrt(stiffness / reduced) * t))
+    link = force * t**2 / (2 * whole) - rotor / whole * twist
+    assert np.ptp(twist) > 5e-3
+    np.testing.assert_allclose(q[:, 0], link, atol=0.02 * np.ptp(twist) + force / whole * STEP * t[-1])
+    np.testing.assert_allclose(q[:, 1] - q[:, 0], twist, atol=0.05 * np.ptp(twist))
+
+
+def test_an_elastic_drive_rings_down_by_its_damping(build, simulate) -> None:
+    model = build(PLAIN, {"flexible_joint": {"compliance": 1 / 400, "damping_ratio": 0.1}})
+    q, _ = simulate(model, np.where(np.arange(2000) < 20, 5.0, 0.0)[:, None])
+    twist = (q[:, 1] - q[:, 0])[20:]
+    tops = twist[1:-1][(twist[1:-1] > twist[:-2]) & (twist[1:-1] > twist[2:])]
+    np.testing.assert_allclose(np.log(tops[:-1] / tops[1:])[:4], 2 * np.pi * 0.1 / np.sqrt(1 - 0.01), rtol=0.05)
+
+
+def test_springs_in_a_row_add_up_and_pull_beyond_the_play(simulate) -> None:
+    play, soft = {"backlash": {"gap": 0.03}}, {"flexible_joint": {"compliance": 0.01}}
+    for gaps, away in (([soft], 0.01), ([soft, soft], 0.02), ([play, soft], 0.04), ([soft, play], 0.04)):
+        scene = HELD.replace('range="-170 170"', 'range="-170 170" damping="2"')
+        model = _edited(scene.replace('kv="20"', 'kv="20" forcerange="-1 1"'), *gaps)
+        assert model.nq == 2
+        q, _ = simulate(model, np.full((8000, 1), 3.0), qpos=[0.1, 0.1])  # 1 N m against gravity
+        assert q[-1, 1] - q[-1, 0] == pytest.approx(away, rel=0.02), gaps
+
+
+@pytest.mark.parametrize("integrator", ["implicitfast", "implicit", "Euler"])
+@pytest.mark.parametrize("numbers", [{"compliance": 1e-12}, {"compliance": 1e-12, "damping_ratio": 5.0}])
+def test_a_spring_that_no_step_can_follow_is_as_good_as_rigid(build, simulate, integrator, numbers) -> None:
+    ctrl = 3.0 * np.sin(20 * STEP * np.arange(3000))[:, None]
+    scene = PLAIN.replace("implicitfast", integrator)
+    stiff, rigid = (simulate(build(scene, g), ctrl)[0][:, 0] for g in ({"flexible_joint": numbers}, {}))
+    np.testing.assert_allclose(stiff, rigid, atol=1e-3 * np.ptp(rigid))
+
+
+def test_rotors_are_ahead_by_the_twist_that_moves_their_joint(build, simulate) -> None:
+    model = build(PLAIN, {"flexible_joint": {"compliance": 0.01}})
+    qpos, qvel = np.array([[0.3, 9.0]]), np.array([[1.0, 9.0]])
+    effects.place_rotors(model, qpos, qvel, np.array([[2.0, 0.0]]))
+    np.testing.assert_allclose(qpos, [[0.3, 0.3 + 0.01 * 0.95 * MASS * 2.0]])
+    np.testing.assert_allclose(qvel, [[1.0, 1.0]])
+
+
 def test_a_spring_oscillates_about_its_rest(build, simulate) -> None:
     stiffness, rest = 50.0, 0.1
     q, _ = simulate(build(PLAIN, {"joint_stiffness": {"stiffness": stiffness, "rest": rest}}), np.zeros((3000, 1)))

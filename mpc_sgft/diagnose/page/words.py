@@ -23,6 +23,7 @@ SAYS: dict[str, Callable[[str, dict[str, float], Callable[[str], str]], str]] = 
     "joint_stiffness": lambda at, x, u: f"a spring of {u('stiffness')} pulls {at} towards {u('rest')}",
     "armature": lambda at, x, u: f"the rotor of {at} has {u('inertia')} {_more(x['inertia'])} inertia",
     "backlash": lambda at, x, u: f"the drive of {at} has a play of {u('gap')}",
+    "flexible_joint": lambda at, x, u: f"the drive of {at} is elastic: it gives way by {u('compliance')}",
     "gravity_tilt": lambda at, x, u: f"the base is tilted by {u('angle')} and rolled by {u('roll')}",
     "payload": lambda at, x, u: f"{at} carries {u('mass')} {'more' if x['mass'] >= 0 else 'less'}",
     "contact_friction": lambda at, x, u: f"{at} slides with a friction coefficient of {x['coefficient']:.3g}",

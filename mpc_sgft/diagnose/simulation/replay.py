@@ -32,7 +32,7 @@ FORCED = CTRL | int(mujoco.mjtState.mjSTATE_QFRC_APPLIED)
 THREADS = int(os.environ.get("OMP_NUM_THREADS", len(os.sched_getaffinity(0))))
 NOTHING = mujoco.MjSpec().compile()
 SIZES = [n for n in dir(NOTHING) if n[0] == "n" and isinstance(getattr(NOTHING, n), int)]  # of all arrays of a model
-LEAD = 0.3  # [s] before a window, to find how rotors lean and bristles bend at its start
+LEAD = 0.6  # [s] before a window, to find how rotors lean and bristles bend at its start
 STIFF = 0.2  # of a joint's inertia
 EXPLODED = 1e6  # predictions are clipped here, so that an unstable candidate is bad, not infinite
 

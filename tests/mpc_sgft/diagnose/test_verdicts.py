@@ -20,6 +20,9 @@ SANDER = """<mujoco><option timestep="0.002"/><worldbody><geom name="table" type
 SERVO = """<mujoco><option timestep="0.002"/><worldbody><body name="arm"><joint name="hinge" axis="0 -1 0"/>
 <inertial pos="0 0 -0.2" mass="1" diaginertia="0.02 0.02 0.001"/></body></worldbody>
 <actuator><position name="servo" joint="hinge" kp="47" kv="2.9" {}/></actuator></mujoco>"""
+GEARED = """<mujoco><option timestep="0.002"/><worldbody><body name="table"><joint name="x" type="slide" axis="1 0 0"
+damping="4" armature="2"/><geom size="0.1" mass="3"/></body></worldbody>
+<actuator><motor name="motor" joint="x" gear="10"/></actuator></mujoco>"""
 FEW = ["viscous_friction", "coulomb_friction", "quadratic_drag", "actuator_delay", "actuator_offset"]
 
 
@@ -98,3 +101,27 @@ def test_a_servo_that_saturates_once_is_found(tmp_path: Path) -> None:
     report = diagnose(tmp_path / "servo.xml", [tmp_path / "servo.csv"], effects=few).as_dict()
     assert [e["name"] for e in report["effects"]] == ["torque_saturation"], report["reason"]
     assert abs(report["effects"][0]["parameters"]["limit"]["value"] - 0.5) < 0.005
+
+
+def test_an_elastic_drive_is_told_from_a_load_and_a_gain(tmp_path: Path) -> None:
+    """Rotor and table of a spindle that twists, by an integrator of its own; eight hertz against each other."""
+    stiffness, dt, table, rotor = 3000.0, 0.004, 3.0, 2.0
+    damping = 2 * 0.02 * np.sqrt(stiffness * table * rotor / (table + rotor))
+    t, rng, h, read = np.arange(1500) * dt, np.random.default_rng(0), dt / 40, []
+    u = sum(1.5 / np.sqrt(k) * np.cos(2 * np.pi * k * 0.37 * t + k * k) for k in (1, 2, 3, 5, 8, 13))
+    q = v = turn = speed = 0.0
+    for command in u.tolist():
+        read.append(q)
+        for _ in range(40):
+            pull = stiffness * (turn - q) + damping * (speed - v)
+            v, speed = v + h * (pull - 4 * v) / table, speed + h * (10 * command - pull) / rotor
+            q, turn = q + h * v, turn + h * speed
+    read = np.array(read) + 2e-5 * rng.standard_normal(len(t))
+    (tmp_path / "spindle.xml").write_text(GEARED)
+    write_csv(tmp_path / "spindle.csv", {"time": t, "ctrl/motor": u, "qpos/x": read})
+    few = ["payload", "actuator_gain", "flexible_joint"]
+    report = diagnose(tmp_path / "spindle.xml", [tmp_path / "spindle.csv"], effects=few).as_dict()
+    assert [e["name"] for e in report["effects"]] == ["flexible_joint"], report["reason"]
+    compliance = report["effects"][0]["parameters"]["compliance"]
+    assert abs(compliance["value"] * stiffness - 1) < 0.02 and compliance["low"] * stiffness < 1.01
+    assert report["held_out"]["reduction"] > 0.8

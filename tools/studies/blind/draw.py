@@ -27,7 +27,7 @@ FAMILIES = (
     ("actuator_delay", "actuator_lag", "sensor_delay"),
     ("payload", "armature", "actuator_gain", "sensor_gain"),
     ("actuator_offset", "gravity_tilt", "sensor_offset"),
-    ("torque_saturation", "deadband", "backlash", "joint_stiffness"),
+    ("torque_saturation", "deadband", "backlash", "flexible_joint", "joint_stiffness"),
 )
 FRICTION_PAIRS = ({"viscous_friction", "coulomb_friction"}, {"asymmetric_friction", "coulomb_friction"})
 INERTIAL = {"payload", "armature", "actuator_gain", "sensor_gain", "gravity_tilt"}  # too close to a wrong mass or gain

@@ -195,6 +195,9 @@ LIBRARY: dict[str, Entry] = {
     ),
     "deadband": Entry("actuator", *_pair(_u, 0.02, 0.6), _add("deadband"), _named("width")),
     "backlash": Entry("joint", *_pair(_q, 0.002, 0.08), _backlash, _named("gap")),
+    "flexible_joint": Entry(
+        "joint", *_pair(_q, 0.005, 0.08), _flexible, lambda size, shape, scales: {"compliance": size / scales["F"]}
+    ),
     "joint_stiffness": Entry(
         "joint", *_pair(lambda s: s["F"] / s["Q"], 0.02, 1.5), _add("spring"), _named("stiffness")
     ),
@@ -204,7 +207,6 @@ LIBRARY: dict[str, Entry] = {
     "sensor_delay": Entry("signal", *_pair(_one, 0.004, 0.05), _add("sensor_delay"), _named("delay"), SMALLEST_TIME),
 }
 OUTSIDE: dict[str, Entry] = {
-    "flexible_joint": Entry("joint", *_pair(_q, 0.005, 0.08), _flexible, _nothing),
     "cogging": Entry("joint", *_pair(_f, 0.05, 1), _cogging, _nothing),
     "position_dependent_friction": Entry("joint", *_pair(_one, 0.3, 0.95), _wave, _nothing, 0.3),
     "temperature_drift": Entry("scene", *_pair(_one, 0.05, 0.8), _drift, _nothing),
@@ -213,7 +215,8 @@ OUTSIDE: dict[str, Entry] = {
 EVERYTHING = LIBRARY | OUTSIDE
 
 _FRICTION = ("viscous_friction", "coulomb_friction", "asymmetric_friction", "stribeck_friction", "quadratic_drag")
-_DRIVE = ("actuator_delay", "actuator_lag", "torque_saturation", "deadband", "backlash", "joint_stiffness")
+_COMMAND = ("actuator_delay", "actuator_lag", "torque_saturation", "deadband")
+_DRIVE = (*_COMMAND, "backlash", "flexible_joint", "joint_stiffness")
 # Joints at which an effect leaves a trace of its own, so that data of this kind can name it (see `equivalents`).
 SITES: dict[str, dict[str, tuple[int, ...]]] = {
     "slide": {name: (0,) for name in (*_FRICTION, *_DRIVE, "actuator_offset", "load_dependent_friction")},

@@ -19,6 +19,7 @@ BODY = ("m", "c", "l", "i")
 Range = tuple[float, float]
 _FRICTION = ("viscous_friction", "coulomb_friction", "asymmetric_friction", "stribeck_friction", "quadratic_drag")
 _DRIVE = ("actuator_delay", "actuator_lag", "torque_saturation", "deadband", "actuator_offset")
+_GEAR = ("backlash", "flexible_joint")
 _SENSOR = ("sensor_gain", "sensor_offset")
 
 
@@ -61,7 +62,6 @@ def _sites(*names: str, joints: tuple[int, ...] = (0,)) -> dict[str, tuple[int, 
 
 
 _OUTSIDE = _sites("cogging", "position_dependent_friction", "temperature_drift")
-_ELASTIC = _OUTSIDE | _sites("flexible_joint")
 _CARRIAGE, _ROD = {"c": (0.0, 0.0), "l": (0.0, 0.0), "i": (0.01, 0.01)}, {"c": (0.15, 0.22), "l": (0.32, 0.42)}
 
 
@@ -78,10 +78,8 @@ SCENES: dict[str, Scene] = {
         False,
         _bodies(_CARRIAGE | {"m": (5, 15)})
         | {"armature": ((10, 40),), "damping": ((10, 60),), "gear": ((200, 600),), "limit": ((2000, 2000),)},
-        _sites(
-            *_FRICTION, *_DRIVE, "load_dependent_friction", "joint_stiffness", "backlash", "payload", "actuator_gain"
-        ),
-        _ELASTIC,
+        _sites(*_FRICTION, *_DRIVE, "load_dependent_friction", "joint_stiffness", *_GEAR, "payload", "actuator_gain"),
+        _OUTSIDE,
         False,
     ),
     "slide": Scene(
@@ -92,10 +90,8 @@ SCENES: dict[str, Scene] = {
         False,
         _bodies(_CARRIAGE | {"m": (2, 8)})
         | {"armature": ((0.5, 2),), "damping": ((2, 8),), "gear": ((10, 30),), "limit": ((150, 150),)},
-        _sites(
-            *_FRICTION, *_DRIVE, "load_dependent_friction", "joint_stiffness", "backlash", "payload", "actuator_gain"
-        ),
-        _ELASTIC,
+        _sites(*_FRICTION, *_DRIVE, "load_dependent_friction", "joint_stiffness", *_GEAR, "payload", "actuator_gain"),
+        _OUTSIDE,
         False,
     ),
     "servo": Scene(  # a pendulum on a servo whose current is limited
@@ -107,8 +103,8 @@ SCENES: dict[str, Scene] = {
         _bodies(_ROD | {"m": (0.4, 1.2), "i": (0.004, 0.01)})
         | {"armature": ((0.01, 0.04),), "damping": ((0.02, 0.1),), "kp": ((25, 60),), "kv": ((1.2, 3),)}
         | {"limit": ((20, 20),)},
-        _sites(*_FRICTION, *_DRIVE, *_SENSOR, "actuator_gain", "payload", "armature", "backlash", "joint_stiffness"),
-        _ELASTIC,
+        _sites(*_FRICTION, *_DRIVE, *_SENSOR, "actuator_gain", "payload", "armature", *_GEAR, "joint_stiffness"),
+        _OUTSIDE,
         False,
     ),
     "pendulum": Scene(
@@ -119,8 +115,8 @@ SCENES: dict[str, Scene] = {
         False,
         _bodies(_ROD | {"m": (0.6, 1.6), "i": (0.004, 0.012)})
         | {"armature": ((0.01, 0.03),), "damping": ((0.01, 0.06),), "gear": ((4, 8),), "limit": ((30, 30),)},
-        _sites(*_FRICTION, *_DRIVE, *_SENSOR, "actuator_gain", "payload", "armature", "backlash", "gravity_tilt"),
-        _ELASTIC,
+        _sites(*_FRICTION, *_DRIVE, *_SENSOR, "actuator_gain", "payload", "armature", *_GEAR, "gravity_tilt"),
+        _OUTSIDE,
         True,
     ),
     "arm": Scene(
@@ -134,8 +130,8 @@ SCENES: dict[str, Scene] = {
         | {"gear": ((10, 20), (5, 10)), "limit": ((80, 80), (40, 40))},
         _sites(*_FRICTION, *_DRIVE, *_SENSOR, "actuator_gain", joints=(0, 1))
         | _sites("payload", joints=(1,))
-        | _sites("gravity_tilt", "armature", "backlash"),
-        _ELASTIC | _sites("cogging", "position_dependent_friction", joints=(0, 1)),
+        | _sites("gravity_tilt", "armature", *_GEAR),
+        _OUTSIDE | _sites("cogging", "position_dependent_friction", joints=(0, 1)),
         True,
     ),
     "cartpole": Scene(
