@@ -16,6 +16,7 @@ FASTEST = 1.0  # oscillation of rotor and joint against each other, in radians a
 MOST_DAMPED = 0.25  # share of their speed against each other that a step may take
 ROTOR_SHARE = 0.05  # of the joint's inertia, where the model has no armature
 IMPLICIT = (int(mujoco.mjtIntegrator.mjINT_IMPLICIT), int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST))
+SOON = 1e-4  # [s] to differentiate forces along the motion
 CENTRE_MASS = 1e-9  # [kg] MuJoCo wants a mass; the rotor's inertia is its joint's armature
 
 
@@ -54,7 +55,7 @@ class Coupling(NamedTuple):
         """Add a spring in series, which twists by `compliance` under 1 N m or 1 N, beyond the play if there is one.
 
         The implicit integrators know of the damping what acts on each of the two, and not what they do to each other,
-        so that both are heavier by `step * damping`; the rotor is made lighter by as much.
+        so that either is heavier by `step * damping`; the rotor is made lighter by what both are.
 
         Args:
             compliance: rad/(N m) or m/N.
@@ -154,18 +155,21 @@ def _drives(actuator: Any, joint: str) -> bool:
     return bool(joint) and actuator.target == joint and actuator.trntype in kinds and has_input
 
 
-def place_rotors(model: mujoco.MjModel, qpos: Array, qvel: Array, qacc: Array | None = None) -> None:
+def place_rotors(
+    model: mujoco.MjModel, qpos: Array, qvel: Array, qacc: Array | None = None, jerk: Array | None = None
+) -> None:
     """Put every rotor where its joint is, moving with it; in place.
 
     A start that comes from measured joints has to be completed by this: rotors are not measured. A rotor leans against
-    the flank, or is ahead by the twist, through which it gives its joint the acceleration; without one it is in the
-    middle of the play.
+    the flank, or is ahead by the twist, through which it gives its joint the acceleration, and twists at the rate at
+    which that changes; without one it is in the middle of the play.
 
     Args:
         model: A scene, with or without rotors.
         qpos: [..., nq], with the joints set.
         qvel: [..., nv], with the joints set.
         qacc: [..., nv], with the joints set.
+        jerk: The same of the derivative of qacc; 0 if None.
     """
     rotors = [i for i in range(model.njnt) if model.joint(i).name.startswith(ROTOR)]
     joints = [model.joint(model.joint(i).name.removeprefix(ROTOR)) for i in rotors]
@@ -175,16 +179,27 @@ def place_rotors(model: mujoco.MjModel, qpos: Array, qvel: Array, qacc: Array | 
     if not rotors or qacc is None:
         return
     data = mujoco.MjData(model)
-    needed = np.zeros(model.nv)
+    tendons = [model.tendon(model.joint(i).name).id for i in rotors]
+    elastic = model.tendon_stiffness[tendons] > 0
+    softness = np.divide(1.0, model.tendon_stiffness[tendons], where=elastic, out=np.zeros(len(rotors)))
+    play = np.where(elastic, model.tendon_lengthspring[tendons, 1], model.tendon_range[tendons, 1])
+    at_joints = [joint.dofadr[0] for joint in joints]
     for at in np.ndindex(qpos.shape[:-1]):
-        data.qpos[:], data.qvel[:] = qpos[at], qvel[at]
-        mujoco.mj_fwdPosition(model, data)
-        mujoco.mj_fwdVelocity(model, data)
-        mujoco.mj_mulM(model, data, needed, qacc[at])
-        dry = model.dof_frictionloss * np.sign(qvel[at])
-        force = needed + data.qfrc_bias - data.qfrc_passive + dry
-        for i, joint in zip(rotors, joints, strict=True):
-            push, tendon = force[joint.dofadr[0]], model.tendon(model.joint(i).name).id
-            stiffness = float(model.tendon_stiffness[tendon])
-            play = (model.tendon_lengthspring if stiffness else model.tendon_range)[tendon, 1]
-            qpos[(*at, model.jnt_qposadr[i])] += play * np.sign(push) + (push / stiffness if stiffness else 0.0)
+        q, v, a = qpos[at].copy(), qvel[at].copy(), qacc[at].copy()
+        a[model.jnt_dofadr[rotors]] = a[at_joints]
+        push = _forces(model, data, q, v, a)[at_joints]
+        qpos[at][model.jnt_qposadr[rotors]] += play * np.sign(push) + softness * push
+        if jerk is not None and elastic.any():
+            then = q.copy()
+            mujoco.mj_integratePos(model, then, v, SOON)
+            rate = (_forces(model, data, then, v + SOON * a, a + SOON * jerk[at])[at_joints] - push) / SOON
+            qvel[at][model.jnt_dofadr[rotors]] += softness * rate
+
+
+def _forces(model: mujoco.MjModel, data: mujoco.MjData, q: Array, v: Array, a: Array) -> Array:
+    """On each joint, for this acceleration, beyond those of springs, dampers and gravity compensation, [nv]."""
+    data.qpos[:], data.qvel[:], needed = q, v, np.zeros(model.nv)
+    mujoco.mj_fwdPosition(model, data)
+    mujoco.mj_fwdVelocity(model, data)
+    mujoco.mj_mulM(model, data, needed, a)
+    return needed + data.qfrc_bias - data.qfrc_passive + model.dof_frictionloss * np.sign(v)

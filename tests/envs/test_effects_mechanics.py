@@ -178,9 +178,9 @@ def test_a_spring_that_no_step_can_follow_is_as_good_as_rigid(build, simulate, i
 def test_rotors_are_ahead_by_the_twist_that_moves_their_joint(build, simulate) -> None:
     model = build(PLAIN, {"flexible_joint": {"compliance": 0.01}})
     qpos, qvel = np.array([[0.3, 9.0]]), np.array([[1.0, 9.0]])
-    effects.place_rotors(model, qpos, qvel, np.array([[2.0, 0.0]]))
+    effects.place_rotors(model, qpos, qvel, np.array([[2.0, 0.0]]), np.array([[30.0, 0.0]]))
     np.testing.assert_allclose(qpos, [[0.3, 0.3 + 0.01 * 0.95 * MASS * 2.0]])
-    np.testing.assert_allclose(qvel, [[1.0, 1.0]])
+    np.testing.assert_allclose(qvel, [[1.0, 1.0 + 0.01 * 0.95 * MASS * 30.0]], rtol=1e-6)
 
 
 def test_a_spring_oscillates_about_its_rest(build, simulate) -> None:

@@ -22,7 +22,7 @@ class Windows(NamedTuple):
         start: Index of its first sample, [W].
         samples: n, predicted samples after the start.
         measured: Signals at these samples, [W, n, S].
-        q0, v0, a0: Measured start of each joint, [W, nj].
+        q0, v0, a0, j0: Measured start of each joint, to the third derivative of its position, [W, nj].
         acting: From when to when after its tick the command acts whose force a sample shows [s], [W, n, 2].
     """
 
@@ -33,6 +33,7 @@ class Windows(NamedTuple):
     q0: Array
     v0: Array
     a0: Array
+    j0: Array
     acting: Array
 
 
@@ -65,6 +66,7 @@ def at(
     def at_start(what: str) -> Array:
         return np.array([getattr(smoothed[i], what)[s] for i, s in zip(episode, start, strict=True)])
 
+    jerk = [np.gradient(s.a, e.dt, axis=0) for s, e in zip(smoothed, episodes, strict=True)]
     off = np.array([np.broadcast_to(episodes[i].off_tick, len(episodes[i].ctrl))[r] for i, r in rows])
     known = np.isfinite(off)[..., None]
     return Windows(
@@ -75,5 +77,6 @@ def at(
         at_start("q"),
         at_start("v"),
         at_start("a"),
+        np.array([jerk[i][s] for i, s in zip(episode, start, strict=True)]),
         np.where(known, np.nan_to_num(off)[..., None] + AFTER, EITHER),
     )

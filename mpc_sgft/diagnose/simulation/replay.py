@@ -192,11 +192,11 @@ class Replayer:
         if shift is not None:
             q, v = q + shift[:, None, :nj], v + shift[:, None, nj:]
         state[:, :, 1 + qadr], state[:, :, 1 + m.nq + vadr] = q, v
-        qacc = np.zeros((count, m.nv))
-        qacc[:, vadr] = w.a0[pick]
+        qacc, jerk = np.zeros((2, count, m.nv))
+        qacc[:, vadr], jerk[:, vadr] = w.a0[pick], w.j0[pick]
         for model, rows in zip(models, state, strict=True):
             qpos, qvel, act = np.split(rows[:, 1 : 1 + m.nq + m.nv + m.na], [m.nq, m.nq + m.nv], 1)
-            place_rotors(model, qpos, qvel, qacc)
+            place_rotors(model, qpos, qvel, qacc, jerk)
             bend_bristles(model, qvel, act)
         rotors = [j for j in map(m.joint, range(m.njnt)) if j.name.startswith(ROTOR)]
         if self.ahead.any() and (rotors or bristles(m)):

@@ -372,6 +372,15 @@ def test_rotors_come_to_the_window_as_the_motion_before_left_them() -> None:
     assert (guessed > 3e-3).sum() > 2 > (led > 2e-3).sum() and led.mean() < 0.4 * guessed.mean()
 
 
+def test_a_window_begins_with_an_elastic_drive_that_rings() -> None:
+    """How the joint's acceleration changes tells how fast the drive twists; without it the window begins at rest."""
+    plant = Plant(mujoco.MjSpec.from_string(SLIDE.replace('axis="1 0 0"/>', 'axis="1 0 0" armature="0.5"/>')))
+    spring = make_term(plant, "flexible_joint", "x", TypicalSizes()).build(np.array([1 / 300]))
+    u = 4 * np.sign(np.cos(3 * 0.002 * np.arange(3000)))
+    led, guessed = _window_errors(plant, spring, u)
+    assert led.mean() < 1e-3 and guessed.mean() < 2e-3  # 13e-3 by whoever begins without a twist that changes
+
+
 def test_bristles_come_to_the_window_as_the_motion_before_bent_them(plant) -> None:
     """Where a joint hardly moves, its speed does not tell how far its bristles are bent."""
     numbers = np.array([1.0, 0.5, 0.05, 0.01, 0.3])  # coulomb, excess, velocity, deflection, damping ratio
