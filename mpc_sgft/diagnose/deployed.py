@@ -41,7 +41,16 @@ MOST = 64  # windows
 ASTRAY = 4.0  # mean square of a joint's error, in units of what noise and contacts make: that joint is suspected alone
 UNITS = {"observation": "of the observation", "drive": "of the control", "qpos": "rad"}
 EFFORT = Effort(
-    beam=(2,), full=(5, 4, 3), starts=2, screen_windows=16, quick_windows=16, enough=1.0, pairs=0, exchange=0, most=1000
+    beam=(2,),
+    full=(5, 4, 3),
+    starts=2,
+    screen_windows=16,
+    quick_windows=16,
+    enough=0.1,  # of a mean of log(1 + e): where nothing is hidden, 0.02 is left
+    alone=3,
+    pairs=0,
+    exchange=0,
+    most=1000,
 )
 
 

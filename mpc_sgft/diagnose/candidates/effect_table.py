@@ -86,7 +86,8 @@ TABLE: dict[str, EffectFacts] = {
         {"gap": Parameter(0.0, lambda s: 0.1 * s.travel, (0.003, 0.03, 0.3), 0.0, 10.0)}, driven=True
     ),
     "flexible_joint": EffectFacts(
-        {"compliance": Parameter(0.0, lambda s: 0.1 * s.travel / s.force, (0.02, 0.07, 0.25, 0.8), 0.0, 10.0)}, driven=True
+        {"compliance": Parameter(0.0, lambda s: 0.1 * s.travel / s.force, (0.02, 0.07, 0.25, 0.8), 0.0, 10.0)},
+        driven=True,
     ),
     "gravity_tilt": EffectFacts({"angle": _tilt, "roll": _tilt}, variants=({"roll": 0.0}, {"angle": 0.0}, {})),
     "payload": EffectFacts({"mass": Parameter(0.0, lambda s: s.mass, (0.2,))}),

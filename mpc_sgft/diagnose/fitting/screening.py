@@ -27,6 +27,7 @@ class Effort(NamedTuple):
         screen_windows, quick_windows: Windows for one step of each, and for quick fits.
         quick, last: Iterations of a quick fit, and of the full one that goes on from it.
         enough: Pairs are tried although no effect alone gains, if the error is above this.
+        alone: Sets that are extended then.
         pairs: Of those that the screened effects make, how many get a quick fit.
         exchange: Full fits with one effect of a set that leaves much replaced by another; 0 for no such exchange.
         most: Effects that are simulated beside those of a set; where there are more, those that promise least are not.
@@ -40,6 +41,7 @@ class Effort(NamedTuple):
     quick: int = 3
     last: int = 8
     enough: float = NOISE + ABOVE_NOISE
+    alone: int = 1
     pairs: int = 6
     exchange: int = 4
     most: int = 30

@@ -88,13 +88,14 @@ def search(
         if not new:
             break
         count = effort.beam[min(level, len(effort.beam) - 1)]
-        beam = sorted(new.values(), key=lambda e: e.error)[:count]
+        ordered = sorted(new.values(), key=lambda e: e.error)
+        beam = ordered[:count]
         if judge.credible(best.errors, beam[0].errors, rng, setup.parts, one_window=setup.one_window(beam[0].errors)):
             best = beam[0]
         elif level or best.error <= effort.enough:
             break
         else:
-            beam = beam[:1]  # pairs may do what nothing does alone
+            beam = ordered[: effort.alone]  # pairs may do what nothing does alone
         if nearer and level == 0 and best.effects and best.error >= setup.quiet:
             setup = nearer(best.fit)
             found = {e.key: e for e in refit(setup, list(found.values()), best)}

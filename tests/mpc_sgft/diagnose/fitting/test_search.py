@@ -64,19 +64,27 @@ def test_a_set_gets_no_more_quick_fits_than_starts_however_well_it_promises() ->
     assert [float(p.start[0][0]) for p in kept] == [1.0, 2.0, 4.0]
 
 
-def found(pairs: int) -> list[set[str]]:
-    problem, fitted = Lines(), np.arange(18)
+def found(pairs: int, problem: Lines | None = None, **numbers: int) -> list[set[str]]:
+    problem, fitted = problem or Lines(), np.arange(18)
     base = fit(problem, [], [], fitted)
     none = np.zeros(1)
     setup = Setup(problem, fitted, np.arange(18, 24), fitted // 3, base, none, none, np.log1p, NOISE)
     terms = [term(name) for name in "abcdefghxy"]
-    effort = Effort(beam=(1,), full=(1, 1, 1), pairs=pairs)
+    effort = Effort(beam=(1,), full=(1, 1, 1), pairs=pairs)._replace(**numbers)
     _, hypotheses = search(setup, terms, 2, np.random.default_rng(0), effort=effort)
     return [set(e.names) for e in hypotheses if e.error < NOISE + 0.1]
 
 
 def test_two_effects_that_nearly_cancel_are_found_together() -> None:
     assert found(pairs=4) == [{"x", "y"}]
+
+
+@pytest.mark.parametrize(("alone", "sets"), [(1, []), (3, [{"x", "y"}])])
+def test_where_no_effect_gains_alone_more_of_them_are_extended(alone: int, sets: list[set[str]]) -> None:
+    """By chance the best of those that do nothing is none of the two that do all together."""
+    problem = Lines()
+    problem.columns["a"] = np.random.default_rng(9).normal(size=problem.y.shape) + 0.03 * problem.y
+    assert found(pairs=0, problem=problem, full=(10, 1, 1), exchange=0, alone=alone) == sets
 
 
 def test_a_small_second_effect_is_found_where_the_first_leaves_less_than_the_noise_that_was_foretold() -> None:
