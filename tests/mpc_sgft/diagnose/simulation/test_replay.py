@@ -1,4 +1,4 @@
-"""The simulator's side: held commands, its own error, and effects with a memory."""
+"""The simulator's side: held commands, its own error, and effects."""
 
 from __future__ import annotations
 
@@ -348,45 +348,6 @@ def test_a_position_is_as_uncertain_as_its_smoothing_bends_it() -> None:
     s = smooth(Episode("a", 0.002, np.zeros((2000, 1)), {"qpos/x": q, "qvel/x": speed}), ["x"])
     off = (np.abs(s.q[:, 0] - true) / s.q_sd[:, 0])[s.half : -s.half]
     assert (off < 3).mean() > 0.97 and off.max() < 10, (np.mean(off < 3), off.max())
-
-
-def _window_errors(plant: Plant, change: Change, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Errors at the ends of windows of a motion that this change made, [W]: led to each window, and not."""
-    m, q = plant.compile(change), []
-    data = mujoco.MjData(m)
-    for command in u:
-        q.append(data.qpos[0])
-        data.ctrl[0] = command
-        mujoco.mj_step(m, data)
-    replayer = Replayer(plant, [Episode("a", 0.002, u[:, None], {"qpos/x": np.array(q)})], 0.3, ["qpos/x"])
-    led = np.abs(replayer.simulate([change])[0] - replayer.windows.measured)[1:, -1, 0]
-    replayer.ahead = np.zeros_like(replayer.ahead)
-    return led, np.abs(replayer.simulate([change])[0] - replayer.windows.measured)[1:, -1, 0]
-
-
-def test_rotors_come_to_the_window_as_the_motion_before_left_them() -> None:
-    """Within the play nothing pushes the joint, so that its acceleration does not tell where the rotor is."""
-    plant = Plant(mujoco.MjSpec.from_string(SLIDE.replace('axis="1 0 0"/>', 'axis="1 0 0" armature="0.5"/>')))
-    play = make_term(plant, "backlash", "x", TypicalSizes()).build(np.array([0.02]))
-    led, guessed = _window_errors(plant, play, 4 * np.cos(3 * 0.002 * np.arange(3000)))
-    assert (guessed > 3e-3).sum() > 2 > (led > 2e-3).sum() and led.mean() < 0.4 * guessed.mean()
-
-
-def test_a_window_begins_with_an_elastic_drive_that_rings() -> None:
-    """How the joint's acceleration changes tells how fast the drive twists; without it the window begins at rest."""
-    plant = Plant(mujoco.MjSpec.from_string(SLIDE.replace('axis="1 0 0"/>', 'axis="1 0 0" armature="0.5"/>')))
-    spring = make_term(plant, "flexible_joint", "x", TypicalSizes()).build(np.array([1 / 300]))
-    u = 4 * np.sign(np.cos(3 * 0.002 * np.arange(3000)))
-    led, guessed = _window_errors(plant, spring, u)
-    assert led.mean() < 1e-3 and guessed.mean() < 2e-3  # 13e-3 by whoever begins without a twist that changes
-
-
-def test_bristles_come_to_the_window_as_the_motion_before_bent_them(plant) -> None:
-    """Where a joint hardly moves, its speed does not tell how far its bristles are bent."""
-    numbers = np.array([1.0, 0.5, 0.05, 0.01, 0.3])  # coulomb, excess, velocity, deflection, damping ratio
-    lugre = make_term(plant, "stribeck_friction", "x", TypicalSizes()).build(numbers)
-    led, guessed = _window_errors(plant, lugre, 2 * np.cos(3 * 0.002 * np.arange(3000)))
-    assert np.median(led) < 1e-3 and led.mean() < 0.4 * guessed.mean()
 
 
 def test_a_saturation_starts_near_what_the_motion_needs_however_much_was_asked() -> None:
