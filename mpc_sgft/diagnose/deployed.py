@@ -25,7 +25,7 @@ from mpc_sgft.diagnose.deployments.next_recording import next_experiment
 from mpc_sgft.diagnose.deployments.recordings import Deployment, read_deployment
 from mpc_sgft.diagnose.fitting.fit import Fit, fit
 from mpc_sgft.diagnose.fitting.hypothesis import Hypothesis
-from mpc_sgft.diagnose.fitting.prepare import Setup, leave_out_blocks, split
+from mpc_sgft.diagnose.fitting.prepare import NOISE, Setup, leave_out_blocks, split
 from mpc_sgft.diagnose.fitting.screening import Effort
 from mpc_sgft.diagnose.fitting.search import search
 from mpc_sgft.diagnose.report import Report
@@ -125,7 +125,7 @@ def prepare(deployment: Deployment, window: float | None, held_out: float | Sequ
     """Cut windows, measure noise and floor, and split episodes.
 
     Sets are compared by the logarithm of windows' errors: objects are hit in few windows, and those differ by orders of
-    magnitude in how much they tell.
+    magnitude in how much they tell. An error is in units of what noise and contacts make.
     """
     dt = deployment.task.control_dt
     length = LENGTH if window is None else max(1, round(window / dt))
@@ -136,7 +136,7 @@ def prepare(deployment: Deployment, window: float | None, held_out: float | Sequ
         [chain.observation_floor, np.full(chain.drive.shape[2], chain.drive_scale), chain.joint_floor]
     )
     noise = np.concatenate([chain.noise, np.zeros(len(floor) - len(chain.noise))])
-    return Setup(chain, fitted, held, blocks, fit(chain, [], [], fitted), noise, floor, np.log1p)
+    return Setup(chain, fitted, held, blocks, fit(chain, [], [], fitted), noise, floor, np.log1p, faint=NOISE)
 
 
 def astray(chain: Chain) -> list[str]:

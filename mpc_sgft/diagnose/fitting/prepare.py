@@ -50,6 +50,7 @@ class Setup(Generic[P]):
         near: The fit near which it is right; None where nothing depends on that.
         squared: What was judged -> that of which shares are taken: the squared error, in units of noise.
         judged: What of a window's error counts when sets are compared; the error itself by default.
+        faint: A nominal error that shows nothing if no window has a larger one.
     """
 
     problem: P
@@ -65,6 +66,7 @@ class Setup(Generic[P]):
     stepping: float = 0.0
     near: Fit | None = None
     squared: Callable[[Array], Array] = field(default=np.asarray)
+    faint: float = -np.inf
 
     def one_window(self, errors: Array) -> bool:
         """Whether several parts of one window may show an effect: where windows are few, and noise alone is left.

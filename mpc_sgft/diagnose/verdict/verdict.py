@@ -73,7 +73,7 @@ def reach_verdict(
     """
     base, there = hypotheses[0], choose(setup, hypotheses, rng)
     best, traces = what_matters(setup, there, hypotheses, rng, tolerance)
-    if tolerance.allows(base.fit):
+    if _nothing(setup, base, tolerance):
         traces, best = [*shares_of(setup, best, there, hypotheses, rng), *traces], base
     probability: defaultdict[frozenset[str], float] = defaultdict(float)  # of sets that are fitted later, too
     rivals = [e for e in hypotheses if e.complexity <= 1 or no_larger(e, best)]  # larger sets are no more credible
@@ -127,8 +127,9 @@ def _no_name(
         rng: For the bootstrap.
         tolerance: Prediction errors that may not matter.
     """
-    if tolerance.allows(base.fit):
-        return "none", "the nominal model's error is within the tolerance"
+    nothing = _nothing(setup, base, tolerance)
+    if nothing:
+        return "none", nothing
     told = foretold(setup, there)
     if residual_model is not None and not tolerance.allows(there.fit) and beats(setup, residual_model, there, rng):
         missed = float((told * (setup.squared(there.errors) - setup.squared(residual_model.errors))).mean())
@@ -150,6 +151,15 @@ def _no_name(
         times = np.sqrt(mean_error(setup, there, told))
         return "unknown", f"{_list(there)} leaves {times:.1f} times noise and floor, which no name explains"
     return "", ""
+
+
+def _nothing(setup: Setup[Any], base: Hypothesis, tolerance: Tolerance) -> str:
+    """Why the nominal model is good enough whatever would lower its error; empty words if it is not."""
+    if tolerance.allows(base.fit):
+        return "the nominal model's error is within the tolerance"
+    if float(base.errors.max()) <= setup.faint:
+        return "the nominal model's error is in no window more than noise and contacts make"
+    return ""
 
 
 def beats(setup: Setup[Any], residual_model: ResidualModel, best: Hypothesis, rng: np.random.Generator) -> bool:

@@ -12,7 +12,7 @@ from mpc_sgft.diagnose.candidates.effect_table import INCLUDES
 from mpc_sgft.diagnose.candidates.library import Term
 from mpc_sgft.diagnose.fitting.fit import fit
 from mpc_sgft.diagnose.fitting.hypothesis import Hypothesis, judge_fit
-from mpc_sgft.diagnose.fitting.prepare import Setup
+from mpc_sgft.diagnose.fitting.prepare import NOISE, Setup
 from mpc_sgft.diagnose.fitting.residual_model import ResidualModel
 from mpc_sgft.diagnose.verdict.naming import find_ties, gains
 from mpc_sgft.diagnose.verdict.relevance import certain, what_matters
@@ -115,6 +115,25 @@ def test_an_error_beyond_the_tolerance_that_no_name_explains_is_unknown(limit: f
     allowed = motion(problem, limit, asked)
     verdict = reach_verdict(setup, [judge_fit(setup, setup.baseline), wrong], None, rng, allowed)
     assert verdict.kind == kind, verdict.reason
+
+
+@pytest.mark.parametrize(("most", "kind"), [(0.6, "none"), (1.3, "effect")])
+def test_an_error_that_is_faint_in_every_window_needs_no_name(most: float, kind: str) -> None:
+    """An effect that lowers it credibly is a trace, unless some window misses by more."""
+    problem, fitted, none = Lines(), np.arange(18), np.zeros(1)
+    problem.y = 0.2 * problem.columns["a"]
+    setup = Setup(problem, fitted, np.arange(18, 24), fitted // 3, fit(problem, [], [], fitted), none, none, np.log1p)
+    scatter = 0.01 * np.abs(np.random.default_rng(0).normal(size=24))
+    worst = scatter + np.where(np.arange(24) == 3, most - 0.5, 0.0)
+    base = judge_fit(setup, setup.baseline)._replace(errors=0.5 + worst)
+    named = judge_fit(setup, fit(problem, [term("a")], [np.ones(1)], fitted))._replace(errors=0.02 + scatter)
+    rng = np.random.default_rng(0)
+    verdict = reach_verdict(replace(setup, faint=NOISE), [base, named], None, rng, motion(problem))
+    assert verdict.kind == kind, verdict.reason
+    assert ([*verdict.best.names], [t.term.effect for t in verdict.traces]) == (
+        ([], ["a"]) if kind == "none" else (["a"], [])
+    )
+    assert reach_verdict(setup, [base, named], None, rng, motion(problem)).kind == "effect"
 
 
 def test_a_rival_that_is_worse_with_the_traces_in_it_does_not_tie() -> None:
