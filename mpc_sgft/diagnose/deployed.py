@@ -23,6 +23,7 @@ from mpc_sgft.diagnose.deployments.missing import missing
 from mpc_sgft.diagnose.deployments.motion_link import JOINT_SAMPLES
 from mpc_sgft.diagnose.deployments.next_recording import next_experiment
 from mpc_sgft.diagnose.deployments.recordings import Deployment, read_deployment
+from mpc_sgft.diagnose.deployments.residual_model import fit_residual_model
 from mpc_sgft.diagnose.fitting.fit import Fit, fit
 from mpc_sgft.diagnose.fitting.hypothesis import Hypothesis
 from mpc_sgft.diagnose.fitting.prepare import NOISE, Setup, leave_out_blocks, split
@@ -31,6 +32,8 @@ from mpc_sgft.diagnose.fitting.search import search
 from mpc_sgft.diagnose.report import Report
 from mpc_sgft.diagnose.rows import Shown, candidate_rows, effect_rows, reduction, trace_rows, unit_of, waterfall
 from mpc_sgft.diagnose.verdict import repair
+from mpc_sgft.diagnose.verdict.naming import choose as choose_set
+from mpc_sgft.diagnose.verdict.naming import settled
 from mpc_sgft.diagnose.verdict.relevance import repairs
 from mpc_sgft.diagnose.verdict.tolerance import Predict, Tolerance, limits_of
 from mpc_sgft.diagnose.verdict.verdict import Verdict, reach_verdict
@@ -98,8 +101,14 @@ def diagnose_run(
             bar.update(round(95 * share) - bar.n)
 
         setup, hypotheses = search(setup, terms, max_effects, rng, show, EFFORT)
-        verdict = reach_verdict(setup, hypotheses, None, rng, tolerated)
-        if verdict.kind == "none" and lost and not (verdict.there.effects or tolerated.allows(setup.baseline)):
+        best = choose_set(setup, hypotheses, rng)
+        residual_model = None if settled(best) else fit_residual_model(setup, best, rng)
+        verdict = reach_verdict(setup, hypotheses, residual_model, rng, tolerated)
+        if (
+            verdict.kind in ("none", "unknown")
+            and lost
+            and not (verdict.there.effects or tolerated.allows(setup.baseline))
+        ):
             reason = (
                 f"{', '.join(lost)}: the measured forces move it otherwise than foretold, and no name explains that"
             )
@@ -109,7 +118,7 @@ def diagnose_run(
     if len(deployment.episodes) == 1:
         notes.append("one episode only: its end is held out, so that both sides come from the same run")
     held = verdict.there if traces else verdict.best
-    report = assemble(setup, hypotheses, verdict, held, notes, rng)
+    report = assemble(setup, hypotheses, verdict, held, notes, rng, residual_model and residual_model.error)
     if out is not None:
         lowers = repairs(setup, held, verdict.there, hypotheses[0], rng)
         repair.into(out, report.data, held, lowers, lambda: write(deployment, held, out))
@@ -183,6 +192,7 @@ def assemble(
     held: Hypothesis,
     notes: list[str],
     rng: np.random.Generator,
+    residual_model_error: float | None,
 ) -> Report:
     """Everything that the report says, `held` in the repaired model; keys as for `--model --data`."""
     chain, best = setup.problem, verdict.best
@@ -215,7 +225,7 @@ def assemble(
             n: {"noise": float(a), "simulator": float(b)}
             for n, a, b in zip(names, setup.noise, setup.floor, strict=True)
         },
-        "residual_model_error": None,
+        "residual_model_error": residual_model_error,
         "seconds": 0.0,
         "repaired_model": None,
         "effects_file": None,

@@ -106,8 +106,11 @@ class Chain:
 
     def residuals(self, terms: Sequence[Term], points: Sequence[Sequence[Array]], pick: Index) -> Array:
         """As `Residuals.residuals`: bent beyond BEND, observation, drive and joints one after the other."""
-        changes = [effects_of(terms, p) for p in points]
-        parts = self.whitened(self.predict(changes, pick), pick)
+        return self.joined(self.predict([effects_of(terms, p) for p in points], pick), pick)
+
+    def joined(self, y: Prediction, pick: Index) -> Array:
+        """Residuals of predictions, each link with the same weight, [K, W, m]."""
+        parts = self.whitened(y, pick)
         m = sum(p.shape[2] for p in parts)
         return np.concatenate([p * np.sqrt(m / (len(parts) * p.shape[2])) for p in parts], 2)
 

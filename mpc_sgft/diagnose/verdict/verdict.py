@@ -26,7 +26,7 @@ from mpc_sgft.diagnose.verdict.tolerance import Tolerance
 from mpc_sgft.diagnose.verdict.uncertainty import Interval, sure_intervals
 
 TIED = 0.5  # of what the user tolerates: sets that foretell the same but for less tie, whatever the data say of them
-LEFT = 0.1  # share of the squared error above noise that names may leave
+LEFT = 0.1  # share of the squared error above noise that names may leave; of a deployment, in as many windows besides
 
 
 class Verdict(NamedTuple):
@@ -137,7 +137,11 @@ def _no_name(
         if share > MATTERS:
             return "unknown", f"a flexible residual model explains {share:.1%} more of the error than {_list(there)}"
     times = np.sqrt(mean_error(setup, best, told))
-    unnamed = not tolerance.allows(there.fit) and judge.leaves_much(there.error, base.error, LEFT)
+    unnamed = not tolerance.allows(there.fit) and _leaves_much(setup, there, base)
+    if unnamed and np.isfinite(setup.faint):
+        left = int((there.errors > setup.faint).sum())
+        windows = f"in {left} of {len(there.errors)} windows, which no name explains"
+        return "unknown", f"{_list(there)} leaves more than noise and contacts make {windows}"
     if not best.effects:
         if tolerance.asked and not settled(base) and unnamed:
             return "unknown", "the nominal model's error is beyond the tolerance, and no name explains it"
@@ -160,6 +164,18 @@ def _nothing(setup: Setup[Any], base: Hypothesis, tolerance: Tolerance) -> str:
     if float(base.errors.max()) <= setup.faint:
         return "the nominal model's error is in no window more than noise and contacts make"
     return ""
+
+
+def _leaves_much(setup: Setup[Any], e: Hypothesis, base: Hypothesis) -> bool:
+    """Whether a set leaves a good part of the nominal model's error.
+
+    Objects of a deployment are hit in few windows, and a mean over all says little of those: there it must be in a good
+    part of the windows that more is left than noise and contacts make.
+    """
+    if not np.isfinite(setup.faint):
+        return judge.leaves_much(e.error, base.error, LEFT)
+    left, nominal = (np.maximum(np.expm1(x.errors) - np.expm1(setup.faint), 0.0) for x in (e, base))
+    return bool((left > 0).mean() > LEFT and left.mean() > LEFT * nominal.mean())
 
 
 def beats(setup: Setup[Any], residual_model: ResidualModel, best: Hypothesis, rng: np.random.Generator) -> bool:

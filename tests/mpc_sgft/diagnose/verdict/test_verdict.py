@@ -136,6 +136,29 @@ def test_an_error_that_is_faint_in_every_window_needs_no_name(most: float, kind:
     assert reach_verdict(setup, [base, named], None, rng, motion(problem)).kind == "effect"
 
 
+@pytest.mark.parametrize(
+    ("within", "kind", "words"),
+    [(8, "effect", "a"), (2, "unknown", "a leaves more than noise and contacts make in 6 of 24 windows")],
+)
+def test_a_name_must_explain_the_windows_in_which_a_deployment_errs(within: int, kind: str, words: str) -> None:
+    """Eight windows of 24 are missed, by four times what noise and contacts make; the others hide that in a mean."""
+    problem, fitted, none = Lines(), np.arange(18), np.zeros(1)
+    problem.y = 0.2 * problem.columns["a"]
+    setup = Setup(problem, fitted, np.arange(18, 24), fitted // 3, fit(problem, [], [], fitted), none, none, np.log1p)
+    setup = replace(setup, faint=NOISE)
+    hit, brought = np.arange(24) % 3 == 0, np.arange(24) < 3 * within
+    low, scatter = 0.03 - 0.02 * hit, 0.005 * np.random.default_rng(0).normal(size=24)
+    base = judge_fit(setup, setup.baseline)._replace(errors=0.2 + scatter + np.where(hit, np.log1p(4.0) - 0.2, 0.0))
+    a = judge_fit(setup, fit(problem, [term("a")], [np.ones(1)], fitted))
+    a = a._replace(errors=np.where(hit & ~brought, np.log1p(3.8), low + np.abs(scatter)))
+    verdict = reach_verdict(setup, [base, a], None, np.random.default_rng(0), motion(problem))
+    assert verdict.kind == kind and words in verdict.reason, verdict.reason
+    alone = reach_verdict(setup, [base], None, np.random.default_rng(0), motion(problem))
+    assert alone.kind == "unknown" and "in 8 of 24 windows, which no name explains" in alone.reason
+    rare = base._replace(errors=np.where(np.arange(24) < 6, base.errors, 0.2))  # two windows: contacts, once in a while
+    assert reach_verdict(setup, [rare], None, np.random.default_rng(0), motion(problem)).kind == "none"
+
+
 def test_a_rival_that_is_worse_with_the_traces_in_it_does_not_tie() -> None:
     problem, fitted, none, rng = Lines(), np.arange(18), np.zeros(1), np.random.default_rng(0)
     setup = Setup(problem, fitted, np.arange(18, 24), fitted // 3, fit(problem, [], [], fitted), none, none, np.log1p)
