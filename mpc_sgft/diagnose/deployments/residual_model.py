@@ -42,7 +42,7 @@ def fit_residual_model(setup: Setup[Chain], best: Hypothesis, rng: np.random.Gen
 
 
 def features(chain: Chain, best: Hypothesis, rng: np.random.Generator) -> Array:
-    """Of each control step of each window: a constant, what is known when it begins, and functions of that, [W, n, F]."""
+    """Of each control step: a constant, what is known when it begins, and functions of that, [W, n, F]."""
     told = chain.commands.drive([effects_of(best.terms, best.values)])[0]  # [E, S, nu], of every physics step
     rows = [
         _known(chain, told[i], int(i), int(s)) for i, s in zip(chain.windows.episode, chain.windows.start, strict=True)
