@@ -84,7 +84,8 @@ def redraw(entropy: tuple[int, ...], group: str, scenes: Mapping[str, float], mi
     elif group == "pair":
         effects = tuple(given(n, sites, rng, mix.pair) for n in _pair(sites, rng))
     elif group == "outside":
-        effects = (given(sorted(outside)[entropy[2] % len(outside)], outside, rng, mix.outside),)
+        turn = (entropy[2] + attempt) % len(outside)  # some of a machine never matter for certain
+        effects = (given(sorted(outside)[turn], outside, rng, mix.outside),)
     return Case(
         name=f"case_{entropy[1]:04d}",
         group=group,
