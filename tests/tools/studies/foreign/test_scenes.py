@@ -45,7 +45,7 @@ def test_a_seed_gives_the_same_cases_and_another_gives_others() -> None:
 
 
 def test_another_case_outside_has_another_effect() -> None:
-    """On some machines one of them never matters for certain: to draw it again would take hours, and end in an error."""
+    """On some machines one of them never matters for certain: it would be drawn for hours, and end in an error."""
     for case in (c for c in draw(5, 100, EVERY, MIX) if c.group == "outside"):
         again = [redraw(case.entropy, case.group, EVERY, MIX, k).effects[0].name for k in range(6)]
         assert len(set(again)) > 1, again
