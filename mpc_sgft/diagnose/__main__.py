@@ -199,6 +199,12 @@ def _run_folder(args: argparse.Namespace) -> int:
         if report.data["effects_file"] is None:
             print("nothing to retrain on: nothing was found that brings simulation nearer to the recordings")
             return 0
+        if report.data["verdict"] == "unknown":
+            print(
+                "not retrained: what is missing is unknown, and a policy for a simulator that is wrong elsewhere can be "
+                "worse than the one there is. More rollouts tell more; --ranges asks for no names"
+            )
+            return 0
         effects = yaml.safe_load((out / report.data["effects_file"]).read_text())["effects"]
         print(table(retrain(args.run, out, args.retrain_transitions, effects=effects)))
     return 0

@@ -45,6 +45,17 @@ def test_a_turned_and_weak_machine_is_named_and_repaired(deployed, tmp_path: Pat
     assert (out / "report.rrd").stat().st_size > 1000
 
 
+def test_nothing_is_trained_on_a_part_of_what_is_missing(deployed, capsys) -> None:
+    run = deployed({"actuator_gain": {"gain": 0.7}, "frame_rotation": {"angle": 0.5, "at": "base"}})
+    summary = {"zero_shot_success": 0.0, "final_success": 0.0, "real_rollouts": 4, "curve": {"0": 0.0, "4": 0.0}}
+    (run / "summary.json").write_text(json.dumps(summary))
+    assert main(["--run", str(run), "--effects", "actuator_gain", "--max-effects", "1", "--retrain"]) == 0
+    said = capsys.readouterr().out
+    assert "Something is missing that no name in the library covers" in said
+    assert "not retrained: what is missing is unknown" in said
+    assert (run / "diagnosis" / "effects.yaml").exists() and not (run / "diagnosis" / "pretrain").exists()
+
+
 def test_ice_is_named_by_how_far_the_puck_slides(deployed) -> None:
     run = deployed({"contact_friction": {"coefficient": 0.05, "at": ["puck"]}}, episodes=5)
     found = diagnose_run(run, effects=["actuator_gain", "contact_friction"])
