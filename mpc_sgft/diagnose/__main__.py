@@ -201,8 +201,8 @@ def _run_folder(args: argparse.Namespace) -> int:
             return 0
         if report.data["verdict"] == "unknown":
             print(
-                "not retrained: what is missing is unknown, and a policy for a simulator that is wrong elsewhere can be "
-                "worse than the one there is. More rollouts tell more; --ranges asks for no names"
+                "not retrained: what is missing is unknown, and a policy for a simulator that is wrong elsewhere can "
+                "be worse than the one there is. More rollouts tell more; --ranges asks for no names"
             )
             return 0
         effects = yaml.safe_load((out / report.data["effects_file"]).read_text())["effects"]
