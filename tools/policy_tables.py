@@ -151,8 +151,12 @@ def loop() -> str:
     head |= {"rollouts to 95 %": "rollouts_to_95_before", "after  ": "rollouts_to_95_after"}
     parts = [pick(read("close_the_loop/close_the_loop.csv"), head)]
     alone = {"gap": "gap", "seed": "seed", "found": "found"} | {k: head[k] for k in ("zero-shot", "after")}
-    identified = pick(read("close_the_loop/identify.csv"), alone)
-    parts.append(f"Identification alone, from ten rollouts of the policy that fails:\n\n{identified}")
+    for file, says in (
+        ("identify", "Identification alone"),
+        ("identify_again", "The same again, by the present solver"),
+    ):
+        identified = pick(read(f"close_the_loop/{file}.csv"), {"verdict": "verdict"} | alone)
+        parts.append(f"{says}, from ten rollouts of the policy that fails:\n\n{identified}")
     for file, says in (
         ("diagnose_run", "What was named"),
         ("diagnose_run_again", "Of others, with the present solver"),

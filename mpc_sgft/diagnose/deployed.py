@@ -26,7 +26,7 @@ from mpc_sgft.diagnose.deployments.recordings import Deployment, read_deployment
 from mpc_sgft.diagnose.deployments.residual_model import fit_residual_model
 from mpc_sgft.diagnose.fitting.fit import Fit, fit
 from mpc_sgft.diagnose.fitting.hypothesis import Hypothesis
-from mpc_sgft.diagnose.fitting.prepare import NOISE, Setup, leave_out_blocks, split
+from mpc_sgft.diagnose.fitting.prepare import Setup, leave_out_blocks, split
 from mpc_sgft.diagnose.fitting.screening import Effort
 from mpc_sgft.diagnose.fitting.search import search
 from mpc_sgft.diagnose.report import Report
@@ -43,6 +43,7 @@ LENGTH = 6  # control steps in a window
 MOST = 64  # windows
 ASTRAY = 4.0  # mean square of a joint's error, in units of what noise and contacts make: that joint is suspected alone
 UNITS = {"observation": "of the observation", "drive": "of the control", "qpos": "rad"}
+FAINT = float(np.log1p(1 / 3))  # log(1 + e) of a window: no link of three errs more than noise and contacts make
 EFFORT = Effort(
     beam=(2,),
     full=(5, 4, 3),
@@ -145,7 +146,7 @@ def prepare(deployment: Deployment, window: float | None, held_out: float | Sequ
         [chain.observation_floor, np.full(chain.drive.shape[2], chain.drive_scale), chain.joint_floor]
     )
     noise = np.concatenate([chain.noise, np.zeros(len(floor) - len(chain.noise))])
-    return Setup(chain, fitted, held, blocks, fit(chain, [], [], fitted), noise, floor, np.log1p, faint=NOISE)
+    return Setup(chain, fitted, held, blocks, fit(chain, [], [], fitted), noise, floor, np.log1p, faint=FAINT)
 
 
 def astray(chain: Chain) -> list[str]:

@@ -1,5 +1,6 @@
-"""A residual model without a name for a deployment: what each link of its chain missed in a control step, by smooth
-random functions of what was commanded, seen and measured when the step began.
+"""A residual model without a name for a deployment: what each link of its chain missed in a control step.
+
+It is foretold by smooth random functions of what was commanded, seen and measured when the step began.
 
 Links are independent of each other, so the fit is a ridge regression for each of their numbers, of what a set of
 effects leaves. It says whether there is a law that no name holds, not what the law is.
@@ -15,7 +16,7 @@ from mpc_sgft.diagnose.deployments.motion_link import JOINT_SAMPLES, at_times
 from mpc_sgft.diagnose.fitting.fit import by_parts
 from mpc_sgft.diagnose.fitting.hypothesis import Hypothesis
 from mpc_sgft.diagnose.fitting.prepare import Setup
-from mpc_sgft.diagnose.fitting.residual_model import RIDGES, ResidualModel
+from mpc_sgft.diagnose.fitting.residual_model import RIDGES, ResidualModel, left_out, solve
 
 BEFORE = 3  # commands that a step may depend on, its own the last
 RANDOM, WIDTHS = 60, (0.1, 0.3, 0.6)  # smooth functions, and how fast they change
@@ -38,7 +39,7 @@ def fit_residual_model(setup: Setup[Chain], best: Hypothesis, rng: np.random.Gen
     corrected = Prediction(y.drive + drive, y.joints + _between(joints), y.observation + seen)
     squares = chain.joined(Prediction(*(part[None] for part in corrected)), everything)[0] ** 2
     order = np.concatenate([setup.fitted, setup.held])
-    return ResidualModel(setup.judged(by_parts(squares[order], setup.parts)), np.zeros(0), 0.0)
+    return ResidualModel(setup.judged(by_parts(squares[order], setup.parts)))
 
 
 def features(chain: Chain, best: Hypothesis, rng: np.random.Generator) -> Array:
@@ -94,21 +95,19 @@ def _foretell(x: Array, missed: Array, scale: Array, setup: Setup[Chain]) -> Arr
 
 def _ridge(a: Array, r: Array, fitted: Index, blocks: Index) -> Array:
     """The regression of r [W, n] on a [W, n, F], of fitted windows without their own block, [W, n]."""
-    norm = np.sqrt((a[fitted] ** 2).mean((0, 1))) + 1e-12
-    a = a / norm
-    grams, sides = np.einsum("wnp,wnq->wpq", a, a), np.einsum("wnp,wn->wp", a, r)
-    one, count = np.eye(a.shape[-1]), r[fitted].size
-    best, least = np.zeros(r.shape), np.log1p((r[fitted] ** 2).mean(1)).mean()
-    for ridge in RIDGES:
-        gram, side = grams[fitted].sum(0) + ridge * count * one, sides[fitted].sum(0)
-        told = a @ np.linalg.solve(gram, side)
-        for b in np.unique(blocks):
-            mine = fitted[blocks == b]
-            told[mine] = a[mine] @ np.linalg.solve(gram - grams[mine].sum(0), side - sides[mine].sum(0))
-        error = np.log1p(((r - told)[fitted] ** 2).mean(1)).mean()
-        if error < least:
-            best, least = told, error
-    return best
+    a = a / (np.sqrt((a[fitted] ** 2).mean((0, 1))) + 1e-12)
+    x, y, told = a[fitted], r[fitted], np.zeros(r.shape)
+    each = np.full(a.shape[-1], float(y.size))
+    choices = [(left_out(x, y, blocks, ridge * each), ridge) for ridge in RIDGES]
+    left, ridge = min(choices, key=lambda c: _size(c[0]))
+    if _size(left) < _size(y):
+        told = -a @ solve(x, y, ridge * each)
+        told[fitted] = y - left
+    return told
+
+
+def _size(r: Array) -> float:
+    return float(np.log1p((r**2).mean(1)).mean())
 
 
 def _between(ends: Array) -> Array:

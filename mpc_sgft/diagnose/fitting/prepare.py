@@ -50,7 +50,7 @@ class Setup(Generic[P]):
         near: The fit near which it is right; None where nothing depends on that.
         squared: What was judged -> that of which shares are taken: the squared error, in units of noise.
         judged: What of a window's error counts when sets are compared; the error itself by default.
-        faint: A nominal error that shows nothing if no window has a larger one.
+        faint: A nominal error that shows nothing if no window has a larger one; -inf where one in the mean decides.
     """
 
     problem: P

@@ -29,13 +29,9 @@ class ResidualModel(NamedTuple):
 
     Attributes:
         errors: Of every window when its block is left out, as sets are judged, [W fitted + W held].
-        weights: Of the features, in PUSH times the typical force of their joint.
-        ridge: Regularisation that left-out blocks prefer.
     """
 
     errors: Array
-    weights: Array
-    ridge: float
 
     @property
     def error(self) -> float:
@@ -68,12 +64,12 @@ def fit_residual_model(
     weight = best.fit.weights[:, None, None]  # as the named effects were fitted
     Xw, rw = X[fitted] * np.sqrt(weight), r0[fitted] * np.sqrt(weight[..., 0])
     free = free * len(fitted) * r0.shape[1]
-    choices = [(_left_out(Xw, rw, setup.blocks, lam * free) / weight[..., 0], lam) for lam in RIDGES]
+    choices = [(left_out(Xw, rw, setup.blocks, lam * free) ** 2 / weight[..., 0], lam) for lam in RIDGES]
     squares, lam = min(choices, key=lambda c: float(np.log1p(c[0].mean(1)).mean()))
-    w = _solve(Xw, rw, lam * free)
+    w = solve(Xw, rw, lam * free)
     held = X[len(fitted) :, :, :count] @ w[:count]
     squares = np.concatenate([squares, (r0[len(fitted) :] + held) ** 2])
-    return ResidualModel(setup.judged(by_parts(squares, setup.parts)), (w / norm)[:count], lam)
+    return ResidualModel(setup.judged(by_parts(squares, setup.parts)))
 
 
 def _features(
@@ -108,18 +104,19 @@ def _features(
     return forces, 1 + (np.array([k for k, _, _ in out]) / SMOOTH) ** 2
 
 
-def _solve(X: Array, r: Array, ridge: Array) -> Array:
+def solve(X: Array, r: Array, ridge: Array) -> Array:
+    """The weights w for which r + X w is least, of X [W, m, F] and r [W, m], [F]."""
     A = np.einsum("wmp,wmq->pq", X, X) + np.diag(ridge)
     return -np.linalg.solve(A, np.einsum("wmp,wm->p", X, r))
 
 
-def _left_out(X: Array, r: Array, blocks: Index, ridge: Array) -> Array:
-    """Squares of each window when its block is left out of the ridge regression, [W, m]."""
+def left_out(X: Array, r: Array, blocks: Index, ridge: Array) -> Array:
+    """r + X w of each window when its block is left out of the ridge regression, [W, m]."""
     A = np.einsum("wmp,wmq->wpq", X, X)
     g = np.einsum("wmp,wm->wp", X, r)
     total_A, total_g, out = A.sum(0) + np.diag(ridge), g.sum(0), np.empty(r.shape)
     for b in np.unique(blocks):
         mine = blocks == b
         w = -np.linalg.solve(total_A - A[mine].sum(0), total_g - g[mine].sum(0))
-        out[mine] = (r[mine] + X[mine] @ w) ** 2
+        out[mine] = r[mine] + X[mine] @ w
     return out

@@ -10,7 +10,7 @@ import numpy as np
 from mpc_sgft.diagnose.fitting import judge
 from mpc_sgft.diagnose.fitting.fit import Fit
 from mpc_sgft.diagnose.fitting.hypothesis import Hypothesis
-from mpc_sgft.diagnose.fitting.prepare import Setup
+from mpc_sgft.diagnose.fitting.prepare import NOISE, Setup
 from mpc_sgft.diagnose.fitting.residual_model import ResidualModel
 from mpc_sgft.diagnose.verdict.naming import as_given, canonical, choose, equivalence, find_ties, no_larger, settled
 from mpc_sgft.diagnose.verdict.relevance import (
@@ -139,7 +139,7 @@ def _no_name(
     times = np.sqrt(mean_error(setup, best, told))
     unnamed = not tolerance.allows(there.fit) and _leaves_much(setup, there, base)
     if unnamed and np.isfinite(setup.faint):
-        left = int((there.errors > setup.faint).sum())
+        left = int((there.errors > NOISE).sum())
         windows = f"in {left} of {len(there.errors)} windows, which no name explains"
         return "unknown", f"{_list(there)} leaves more than noise and contacts make {windows}"
     if not best.effects:
@@ -174,7 +174,7 @@ def _leaves_much(setup: Setup[Any], e: Hypothesis, base: Hypothesis) -> bool:
     """
     if not np.isfinite(setup.faint):
         return judge.leaves_much(e.error, base.error, LEFT)
-    left, nominal = (np.maximum(np.expm1(x.errors) - np.expm1(setup.faint), 0.0) for x in (e, base))
+    left, nominal = (np.maximum(np.expm1(x.errors) - 1, 0.0) for x in (e, base))
     return bool((left > 0).mean() > LEFT and left.mean() > LEFT * nominal.mean())
 
 

@@ -80,6 +80,15 @@ def test_one_joint_is_told_from_all_by_its_force(deployed) -> None:
     assert other["verdict"] == "unknown" and "joint4" in other["reason"]
 
 
+def test_a_little_friction_of_one_joint_is_not_too_faint(deployed) -> None:
+    """No window's whole error is above what noise and contacts make, that of its joints is in all of them."""
+    run = deployed({"coulomb_friction": {"torque": 0.3, "at": ["joint4"]}})
+    report = diagnose_run(run, effects=["coulomb_friction"], max_effects=1).as_dict()
+    (effect,) = report["effects"]
+    assert (report["verdict"], effect["name"], effect["at"]) == ("effect", "coulomb_friction", ["joint4"])
+    assert effect["parameters"]["torque"]["value"] == pytest.approx(0.3, abs=0.03)
+
+
 def test_a_weak_drive_shows_as_a_slope_over_the_command(deployed) -> None:
     run = deployed({"actuator_gain": {"gain": 0.7}}, steps=20)  # later the arm is stretched, and elsewhere than meant
     found = diagnose_run(run, effects=["actuator_gain"])

@@ -82,7 +82,7 @@ def test_an_error_is_unknown_if_a_flexible_model_explains_it(
     setup = Setup(problem, fitted, np.arange(18, 24), fitted // 3, fit(problem, [], [], fitted), none, none)
     errors = np.log1p(left) + 0.01 * np.random.default_rng(0).normal(size=24)
     base = judge_fit(setup, setup.baseline)._replace(errors=errors)
-    model = None if flexible is None else ResidualModel(errors + np.log1p(flexible) - np.log1p(left), np.zeros(1), 1.0)
+    model = None if flexible is None else ResidualModel(errors + np.log1p(flexible) - np.log1p(left))
     verdict = reach_verdict(setup, [base], model, np.random.default_rng(0), motion(problem))
     assert verdict.kind == kind and words in verdict.reason
     assert not verdict.best.effects
