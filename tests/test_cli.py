@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import re
 import subprocess
@@ -30,13 +31,15 @@ def probe(loop: str = "", name: str = "deploy") -> cli.Command:
 def loops(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A module of small loops beside an empty working folder, which it returns."""
     (tmp_path / "probe_loop.py").write_text(
-        "import errno\n"
+        "import errno, gc\n"
+        "imported = gc.isenabled()\n"
         "from mpc_sgft.storage import run_folder\n"
         "from mpc_sgft.command.errors import Stopped\n"
         "def folder(cfg):\n    print(run_folder.start(cfg))\n"
         "def show(cfg):\n    print(cfg.seed, cfg.chosen.gap, cfg.planner.horizon)\n"
         "def stop(cfg):\n    raise Stopped('Saved. Go on with: --resume runs/x')\n"
         "def full(cfg):\n    raise OSError(errno.ENOSPC, 'No space left on device', 'runs/x/metrics.csv')\n"
+        "def garbage(cfg):\n    print(imported, gc.isenabled(), gc.get_freeze_count() > 0)\n"
         "def bug(cfg):\n    raise OSError(errno.EPIPE, 'Broken pipe')\n"
     )
     monkeypatch.syspath_prepend(str(tmp_path))
@@ -146,6 +149,12 @@ def test_a_real_process_ends_with_2_and_no_traceback(name: str, command) -> None
 def test_overrides_reach_the_loop(args: list[str], shown: str, loops: Path, capsys) -> None:
     assert cli.run(probe("show"), args) == 0
     assert capsys.readouterr().out.strip() == shown
+
+
+def test_imports_collect_no_garbage_and_the_loop_does(loops: Path, capsys) -> None:
+    assert cli.run(probe("garbage"), []) == 0
+    assert capsys.readouterr().out.split() == ["False", "True", "True"]
+    assert gc.isenabled() and gc.get_freeze_count() == 0
 
 
 def test_a_sweep_runs_each_value(loops: Path, capfd) -> None:

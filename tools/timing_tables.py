@@ -61,7 +61,8 @@ def growth() -> str:
     """Plans by what they search, start-up times, and bytes of a rollout."""
     head: dict[str, str | tuple[str, Callable[[str], str]]]
     head = {"what": "what", "": "value", "takes": "amount", "unit": "unit", "to the default": "ratio"}
-    return pick(read("scale/cost_growth.csv"), head)
+    rows = [row for row in read("scale/cost_growth.csv") if row["part"] != "start"]
+    return pick([*rows, *read("scale/start.csv")], head)
 
 
 def quality() -> str:

@@ -7,6 +7,7 @@ Exit codes: 0 or what the loop returns; 2: the user can mend it; 3: a number is 
 from __future__ import annotations
 
 import argparse
+import gc
 import os
 import sys
 import textwrap
@@ -88,6 +89,8 @@ def run(command: Command, argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("\nstopped by Ctrl-C", file=sys.stderr)
         return 130
+    finally:
+        gc.unfreeze()
 
 
 def _run(command: Command, flags: argparse.Namespace, given: list[str]) -> int:
@@ -148,8 +151,16 @@ def _sweep(command: Command, overrides: list[str]) -> int:
 
 
 def _loop(command: Command) -> Callable:
-    module, _, function = command.loop.partition(":")
-    return getattr(import_module(module), function)
+    """The command's loop, imported without collecting garbage: nearly all its objects stay."""
+    name, _, function = command.loop.partition(":")
+    if name in sys.modules:
+        return getattr(sys.modules[name], function)
+    gc.disable()
+    try:
+        return getattr(import_module(name), function)
+    finally:
+        gc.freeze()  # until the command ends, later collections leave them out
+        gc.enable()
 
 
 def _parse(command: Command, args: list[str]) -> tuple[argparse.Namespace, list[str]]:
