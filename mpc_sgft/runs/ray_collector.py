@@ -9,6 +9,8 @@ import logging
 import pickle
 import platform
 import socket
+import subprocess
+import sys
 from importlib.metadata import version
 
 import torch
@@ -18,7 +20,9 @@ from mpc_sgft.command.errors import UserError
 from mpc_sgft.runs.collectors import AbstractCollector, check_workers
 from mpc_sgft.runs.explore import Collected, Explorer, Round, joined
 
-ANSWER = 10.0  # [s] within which a cluster must accept a connection
+ANSWER, JOINED = 10.0, 40.0  # [s] within which a cluster must accept a connection, and let somebody join
+TOKEN_SAYS = "If it asks for a token, this machine needs that of its head as ~/.ray/auth_token."
+JOIN = "import ray, sys; ray.init(address=sys.argv[1], log_to_driver=False)"
 STORE = 256 * 2**20  # bytes of shared memory of a cluster that is started here
 MUST_AGREE = ("mpc_sgft", "torch", "mujoco")
 
@@ -41,6 +45,8 @@ class Ray(AbstractCollector):
         except ModuleNotFoundError as error:
             raise UserError("collector=ray needs Ray: pip install 'mpc_sgft[ray]'") from error
         check_workers(workers, cfg.num_envs)
+        if address is not None:
+            _use_token()
         if address is not None and address != "auto":
             _check_answers(address)
         here = {"num_cpus": workers, "include_dashboard": False, "object_store_memory": STORE}
@@ -54,7 +60,8 @@ class Ray(AbstractCollector):
             )
         except (ConnectionError, RuntimeError, ValueError) as error:
             text = " ".join(str(error).split())
-            raise UserError(f"collector.address={address}: Ray could not join that cluster. {text}") from error
+            says = f"collector.address={address}: Ray could not join that cluster. {text} {TOKEN_SAYS}"
+            raise UserError(says) from error
         self._ray, self._found = ray, None
         actor = ray.remote(num_cpus=1, max_restarts=-1, max_task_retries=-1)(_Worker)
         blobs = [pickle.dumps((cfg, sizes, part, workers)) for part in range(workers)]
@@ -108,8 +115,17 @@ class _Worker:
         return pickle.dumps(self._explorer.collect(pickle.loads(blob)))
 
 
+def _use_token() -> None:
+    """With a token at hand, show it to the cluster, as `ray start` does; `ray.init` alone would be turned away."""
+    try:  # Ray has no public way once it is imported, which TorchRL does
+        from ray._private.authentication import authentication_token_setup
+    except ModuleNotFoundError:  # a Ray that knows no tokens
+        return
+    authentication_token_setup.maybe_enable_token_auth_if_token_available(warn_if_disabled=False)
+
+
 def _check_answers(address: str) -> None:
-    """Raise UserError unless something accepts connections there; Ray itself would try for a minute."""
+    """Raise UserError unless a cluster answers there soon; Ray itself would try for a minute or two, deaf to Ctrl-C."""
     host, _, port = address.removeprefix("ray://").rpartition(":")
     if not host or not port.isdigit():
         raise UserError(f"collector.address={address}: host:port, ray://host:port or auto.")
@@ -119,4 +135,11 @@ def _check_answers(address: str) -> None:
         raise UserError(
             f"collector.address={address}: nobody answers ({error}). Start a cluster there with ray start --head, or "
             "leave the address out to start one here."
+        ) from error
+    try:  # what goes wrong in another way, joining it from here says
+        subprocess.run([sys.executable, "-c", JOIN, address], timeout=JOINED, capture_output=True, check=False)
+    except subprocess.TimeoutExpired as error:
+        raise UserError(
+            f"collector.address={address}: something answers, but no Ray cluster that could be joined within "
+            f"{JOINED:.0f} s. Give the address that ray start --head printed, or leave it out to start one here."
         ) from error

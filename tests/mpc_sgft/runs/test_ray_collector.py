@@ -21,6 +21,12 @@ from mpc_sgft.runs.explore import Collected, Explorer, Round, joined, policy_wei
 from mpc_sgft.runs.ray_collector import Ray
 
 pytest.importorskip("ray", reason="needs Ray")
+HEAD = (
+    "import ray, sys\n"
+    "ray.init(address='local', num_cpus=2, include_dashboard=False, object_store_memory=2**28, log_to_driver=False)\n"
+    "print(ray.get_runtime_context().gcs_address, flush=True)\n"
+    "sys.stdin.read()\n"
+)
 CFG = compose.compose("pretrain", ["task=pendulum", "+experiment=debug", "num_envs=5", "device=cpu"], [])
 
 
@@ -68,6 +74,38 @@ def test_an_address_that_nobody_answers_is_one_line_soon(agent) -> None:
         with pytest.raises(UserError, match=r"collector.address=127.0.0.1:\d+: nobody answers") as found:
             Ray(CFG, agent.model.sizes, workers=1, address=f"127.0.0.1:{taken.getsockname()[1]}")
     assert time.monotonic() - began < 15 and "\n" not in str(found.value)
+
+
+def test_what_answers_and_is_no_cluster_is_one_line(agent, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ray_collector, "JOINED", 4.0)
+    with socket.create_server(("127.0.0.1", 0)) as silent:  # accepts, and says nothing
+        with pytest.raises(UserError, match="something answers, but no Ray cluster .* within 4 s") as found:
+            Ray(CFG, agent.model.sizes, workers=1, address=f"127.0.0.1:{silent.getsockname()[1]}")
+    assert "\n" not in str(found.value)
+
+
+def test_a_cluster_that_is_there_is_joined_and_left_as_it_was(tmp_path: Path) -> None:
+    """A process of its own has the cluster, another one pretrains on it; the first one sees its workers come and go."""
+    line, own = [sys.executable, "-c", HEAD], {k: v for k, v in os.environ.items() if k != "RAY_AUTH_MODE"}
+    with subprocess.Popen(line, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=own) as head:
+        assert head.stdin and head.stdout
+        try:
+            address = head.stdout.readline().strip()
+            words = ["task=pendulum", "+experiment=debug", "collector=ray", f"collector.address={address}"]
+            words += [f"run_dir={tmp_path / 'run'}", "log.tensorboard=false"]
+            line = [sys.executable, "-m", "mpc_sgft.pretrain", "--quiet", *words]
+            with subprocess.Popen(line, stderr=subprocess.PIPE, text=True, env=own) as run:
+                deadline = time.monotonic() + 120
+                while run.poll() is None and not workers_of(psutil.Process(head.pid)):
+                    assert time.monotonic() < deadline
+                    time.sleep(0.1)
+                seen = run.poll() is None
+                _, error = run.communicate(timeout=120)
+            assert seen and run.returncode == 0, error
+            assert head.poll() is None and not workers_of(psutil.Process(head.pid))
+        finally:
+            head.stdin.close()
+        assert head.wait(timeout=60) == 0
 
 
 def test_what_is_no_address_is_refused(agent) -> None:
