@@ -13,6 +13,8 @@ def timing() -> str:
     env |= {"control steps / s": "control_steps_per_s", "ControlEnv / this": "control_env_over_this"}
     pairs = (("time_planner", plan), ("time_diagnose", diagnose), ("benchmark_env", env))
     parts = [pick(read(f"timing/{file}.csv"), columns) for file, columns in pairs]
+    like = [row for row in read("timing/time_planner_like.csv") if row["ratio_to_upstream"]]
+    parts[1:1] = ["On cores like upstream's:", pick(like, plan)]
     floor = {"what": "what", "size": "size", "precision": "precision", "GFLOP": "gflop", "GB": "gbyte"}
     floor |= {"peak GFLOP/s": "peak_gflops", "peak GB/s": "peak_gbyte", "least ms": "floor_ms", "best ms": "best_ms"}
     least = pick(read("timing/roofline.csv"), floor)
