@@ -71,7 +71,7 @@ def what_matters(
             traces.append(shares[i])
             best = without
             continue
-        less = simplest(setup, best, hypotheses, told, spare)
+        less = simplest(setup, best, hypotheses, told, spare, tolerance)
         if less is best:
             break
         best = less
@@ -151,10 +151,15 @@ def mean_error(setup: Setup[Any], e: Hypothesis, told: Array) -> float:
 
 
 def simplest(
-    setup: Setup[Any], best: Hypothesis, hypotheses: list[Hypothesis], told: Array, spare: float
+    setup: Setup[Any], best: Hypothesis, hypotheses: list[Hypothesis], told: Array, spare: float, tolerance: Tolerance
 ) -> Hypothesis:
-    """The set with one effect in place of one that includes it, if it leaves at most `spare` more of squared error."""
+    """The set with one effect in place of one that includes it, if what that costs does not matter.
+
+    It leaves at most `spare` more of squared error, and predicts the same but for the tolerance; if the user gave that,
+    it alone decides.
+    """
     enough = mean_error(setup, best, told) + spare
     alike = (e for e in simpler(setup, best, hypotheses) if e.complexity < best.complexity)
-    enough_told = [e for e in alike if mean_error(setup, e, told) <= enough]
+    cheap = [e for e in alike if tolerance.asked or mean_error(setup, e, told) <= enough]
+    enough_told = [e for e in cheap if tolerance.alike(e.fit, best.fit, by_window(told, setup))]
     return min(enough_told, key=lambda e: (e.complexity, e.error), default=best)

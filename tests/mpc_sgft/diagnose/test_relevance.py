@@ -56,6 +56,15 @@ def test_within_the_tolerance_nothing_is_missing(slide: Path, record: Record, tm
     assert loose["effects_file"] is None and not (out / "repaired.xml").exists() and not (out / "effects.yaml").exists()
 
 
+def test_a_simpler_effect_stands_in_within_the_tolerance_alone(slide: Path, record: Record) -> None:
+    """Friction that falls as it starts to slide: Coulomb's alone leaves 3 of 47 mm, 0.4 % of the squared error."""
+    data = record(seconds=8.0, coulomb=3.0, extra=lambda q, v: -2.0 * np.exp(-((v / 0.1) ** 2)) * np.sign(v))
+    for tolerance, name in ((0.002, "stribeck_friction"), (0.01, "coulomb_friction")):  # 1.3 and 6.4 mm
+        effects = ["coulomb_friction", "stribeck_friction"]
+        report = diagnose(slide, [data], effects=effects, tolerance=tolerance).as_dict()
+        assert [e["name"] for e in report["effects"]] == [name], (tolerance, report["reason"])
+
+
 def test_a_repair_that_does_not_repair_is_not_written(slide: Path, record: Record, tmp_path: Path) -> None:
     """Friction that came only after what is held out cannot be seen there."""
     still = record(name="b", seconds=2.0)
