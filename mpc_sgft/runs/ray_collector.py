@@ -125,7 +125,7 @@ def _use_token() -> None:
 
 
 def _check_answers(address: str) -> None:
-    """Raise UserError unless a cluster answers there soon; Ray itself would try for a minute or two, deaf to Ctrl-C."""
+    """Raise UserError unless a cluster answers there soon; Ray itself tries for longer than a minute."""
     host, _, port = address.removeprefix("ray://").rpartition(":")
     if not host or not port.isdigit():
         raise UserError(f"collector.address={address}: host:port, ray://host:port or auto.")
