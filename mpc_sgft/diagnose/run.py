@@ -40,6 +40,7 @@ from mpc_sgft.diagnose.verdict.tolerance import Predict, Tolerance, limits_of
 from mpc_sgft.diagnose.verdict.verdict import Verdict, reach_verdict
 from mpc_sgft.storage.metrics import progress as bar_of
 
+AWAY = 10.0  # times the range of what was measured: no window of a motion leads there
 STEPS = (4 * SHARP, 2 * SHARP, SHARP)  # [s] to simulate with: the longest whose error noise hides
 UNSEEN, NOTHING = 0.2, 0.1  # share of the expected squared error that noise hides in a search, and in a judgement
 
@@ -133,10 +134,15 @@ def run(
         notes.append("one episode only: its end is held out, so that both sides come from the same run")
     held = verdict.there if traces else verdict.best
     left = residual_model and residual_model.error
-    report = assemble(plant, setup, hypotheses, verdict, held, notes, rng, left)
+    fitted = setup.problem.replayer
+    own = Replayer(plant, fitted.episodes, fitted.windows.samples * fitted.dt, fitted.signals)
+    unstable = runs_away(own, fitted, held)
+    if unstable:
+        notes.append(f"errors are those in steps of {1e3 * fitted.h:g} ms, not in the scene's own")
+    report = assemble(setup, hypotheses, verdict, held, notes, rng, left, fitted if unstable else own)
     if out is not None:
         lowers = repairs(setup, held, verdict.there, hypotheses[0], rng)
-        repair.into(out, report.data, held, lowers, lambda: repair.write(plant, held, out))
+        repair.into(out, report.data, held, lowers, lambda: repair.write(plant, held, out), unstable)
         if report.data["repaired_model"]:
             report.diff = repair.diff(repair.nominal_spec(plant), out / report.data["repaired_model"])
     report.data["seconds"] = round(time.perf_counter() - began, 2)
@@ -171,8 +177,25 @@ def _sees(setup: Setup[Problem], e: Hypothesis) -> bool:
     return setup.near is not None and key_of(setup, setup.near.terms) == e.key and setup.stepping < NOTHING
 
 
+def runs_away(own: Replayer, sharp: Replayer, held: Hypothesis) -> str:
+    """That the scene's own time step is too long for what is in the repaired model, in words; else none.
+
+    In shorter steps, with which it was fitted, it stays near what was measured.
+    """
+    span = np.ptp(sharp.windows.measured, axis=(0, 1))
+    far = np.where(span > 0, AWAY * span, np.inf)  # a signal that stood still says nothing
+    change = change_of(held.fit.terms, held.fit.values)
+    left, too = (bool((np.abs(r.simulate([change])[0] - r.windows.measured) > far).any()) for r in (own, sharp))
+    if too or not left:
+        return ""
+    what = " + ".join(held.names) or "refitted quantities"
+    return (
+        f"with {what} the scene runs away in its own timestep of {1e3 * own.h:g} ms. In one of {1e3 * sharp.h:g} ms it "
+        "does not: set that in the scene, and diagnose again"
+    )
+
+
 def assemble(
-    plant: Plant,
     setup: Setup,
     hypotheses: list[Hypothesis],
     verdict: Verdict,
@@ -180,10 +203,10 @@ def assemble(
     notes: list[str],
     rng: np.random.Generator,
     residual_model_error: float | None,
+    replayer: Replayer,
 ) -> Report:
-    """Everything that the report says, `held` in the repaired model; errors are those of the scene in its own steps."""
-    best, base, sharp = verdict.best, setup.baseline, setup.problem.replayer
-    replayer = Replayer(plant, sharp.episodes, sharp.windows.samples * sharp.dt, sharp.signals)
+    """Everything that the report says, `held` in the repaired model; errors are those of `replayer`."""
+    best, base, plant = verdict.best, setup.baseline, replayer.plant
     rows = Shown(_predict(replayer), {n: _unit(plant, n) for n in replayer.signals}, partial(unit_at, plant))
     nominal, repaired = replayer.simulate([Change(), change_of(held.fit.terms, held.fit.values)])
     measured = replayer.windows.measured

@@ -52,7 +52,12 @@ FILES = ("repaired.xml", "effects.yaml")
 
 
 def into(
-    out: Path, data: dict[str, Any], held: Hypothesis, repairs: Repairs, write_files: Callable[[], list[str]]
+    out: Path,
+    data: dict[str, Any],
+    held: Hypothesis,
+    repairs: Repairs,
+    write_files: Callable[[], list[str]],
+    unstable: str = "",
 ) -> None:
     """Write the repair into a folder if it repairs, and say so in the report: those of an earlier report go.
 
@@ -62,6 +67,7 @@ def into(
         held: What the repair holds.
         repairs: Whether it credibly lowers errors.
         write_files: Writes repaired.xml and effects.yaml, and returns notes.
+        unstable: Why the scene cannot be simulated with it, if it cannot.
     """
     out.mkdir(parents=True, exist_ok=True)
     for name in FILES:
@@ -69,6 +75,9 @@ def into(
     if not held.fit.terms:
         return
     what, h = " + ".join(held.names) or "refitted quantities", data["held_out"]
+    if unstable:
+        data["notes"].append(f"no repaired.xml: {unstable}")
+        return
     if not repairs.lowers:
         data["notes"].append(
             f"no repaired.xml: with {what}, errors on {repairs.on} do not credibly fall "

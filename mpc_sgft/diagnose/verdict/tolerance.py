@@ -22,7 +22,6 @@ FITTING = {  # unit of a signal -> those that a tolerance may be given in
     "N or N m": ("N", "mN", "Nm", "mNm"),
 }
 SMALL = 0.01  # of a signal's standard deviation: what changes predictions by less may be a trace if nobody says
-RUNS_AWAY = 1e4  # times the range of what was measured: no motion does that, an unstable simulation soon does
 
 
 @dataclass(frozen=True)
@@ -49,11 +48,6 @@ class Tolerance:
             return False
         missed = ((self.predict([f])[0] - self.measured) ** 2).mean((0, 1)) - self.noise**2
         return bool((missed <= self.limits**2).all())
-
-    def runs_away(self, f: Fit) -> bool:
-        """Whether a fit's predictions leave what was measured far behind in some window."""
-        span = np.ptp(self.measured, axis=(0, 1))
-        return bool((np.abs(self.predict([f])[0] - self.measured) > RUNS_AWAY * np.maximum(span, self.noise)).any())
 
     def alike(self, a: Fit, b: Fit, told: Array, times: float = 1.0) -> bool:
         """Whether two fits predict the same but for so many times the tolerance, on windows of these weights [W]."""

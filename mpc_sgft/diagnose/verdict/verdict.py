@@ -71,8 +71,8 @@ def reach_verdict(
         rng: For the bootstrap.
         tolerance: Prediction errors that may not matter.
     """
-    base = hypotheses[0]
-    there, best, traces = _that_stay(setup, hypotheses, rng, tolerance)
+    base, there = hypotheses[0], choose(setup, hypotheses, rng)
+    best, traces = what_matters(setup, there, hypotheses, rng, tolerance)
     if _nothing(setup, base, tolerance):
         traces, best = [*shares_of(setup, best, there, hypotheses, rng), *traces], base
     probability: defaultdict[frozenset[str], float] = defaultdict(float)  # of sets that are fitted later, too
@@ -105,21 +105,6 @@ def reach_verdict(
     shares = shares_of(setup, best, there, hypotheses, rng)
     sure = sure_intervals(setup, best, tolerance, told)
     return Verdict(kind, best, named, probability, reason, there, shares, traces, sure)
-
-
-def _that_stay(
-    setup: Setup[Any], hypotheses: list[Hypothesis], rng: np.random.Generator, tolerance: Tolerance
-) -> tuple[Hypothesis, Hypothesis, list[Relevance]]:
-    """What is there, what of it matters, and the traces. A set with which the simulation runs away is none of
-    `hypotheses` any more: windows that it loses weigh little, as those do that nothing foretells.
-    """
-    while True:
-        there = choose(setup, hypotheses, rng)
-        best, traces = what_matters(setup, there, hypotheses, rng, tolerance)
-        lost = [e for e in (there, best) if e is not hypotheses[0] and tolerance.runs_away(e.fit)]
-        if not lost:
-            return there, best, traces
-        hypotheses[:] = [e for e in hypotheses if all(e is not x for x in lost)]
 
 
 def _no_name(

@@ -77,6 +77,17 @@ def test_a_repair_that_does_not_repair_is_not_written(slide: Path, record: Recor
     assert any("no repaired.xml" in n and told in n for n in report["notes"]), report["notes"]
 
 
+def test_no_repair_that_runs_away_in_the_scenes_own_steps(slide: Path, record: Record, tmp_path: Path) -> None:
+    """A spring of 60 N/mm on 5 kg: stable in steps of less than 2 sqrt(m / k) = 18 ms."""
+    slide.write_text(slide.read_text().replace('timestep="0.002"', 'timestep="0.03"'))
+    data, out = record(extra=lambda q, v: -6e4 * q - 300 * v, noise=1e-7), tmp_path / "out"
+    report = diagnose(slide, [data], effects=["joint_stiffness", "viscous_friction"], out=out).as_dict()
+    assert [e["name"] for e in report["effects"]] == ["joint_stiffness"] and report["held_out"]["reduction"] > 0.9
+    assert report["repaired_model"] is None and not (out / "repaired.xml").exists()
+    told = "runs away in its own timestep of 30 ms. In one of 0.5 ms it does not"
+    assert any(n.startswith("no repaired.xml") and told in n for n in report["notes"]), report["notes"]
+
+
 @pytest.mark.parametrize(
     ("held_drops", "fitted_drop", "lowers", "on"),
     [

@@ -10,13 +10,12 @@ import pytest
 
 from mpc_sgft.diagnose.candidates.effect_table import INCLUDES
 from mpc_sgft.diagnose.candidates.library import Term
-from mpc_sgft.diagnose.fitting.fit import Fit, fit
+from mpc_sgft.diagnose.fitting.fit import fit
 from mpc_sgft.diagnose.fitting.hypothesis import Hypothesis, judge_fit
 from mpc_sgft.diagnose.fitting.prepare import NOISE, Setup
 from mpc_sgft.diagnose.fitting.residual_model import ResidualModel
 from mpc_sgft.diagnose.verdict.naming import find_ties, gains
 from mpc_sgft.diagnose.verdict.relevance import certain, what_matters
-from mpc_sgft.diagnose.verdict.tolerance import Tolerance
 from mpc_sgft.diagnose.verdict.uncertainty import intervals
 from mpc_sgft.diagnose.verdict.verdict import reach_verdict
 from tests.mpc_sgft.diagnose.lines import Lines, Points, motion, term
@@ -65,26 +64,6 @@ def test_names_that_leave_much_of_an_error_are_no_answer(before: float, after: f
     verdict = reach_verdict(setup, [base, named], None, np.random.default_rng(0), motion(problem))
     assert verdict.kind == kind
     assert verdict.probability[frozenset({"b"})] == 0, "a set that is only fitted to tell shares has won nothing"
-
-
-def test_a_set_with_which_the_simulation_runs_away_is_not_named() -> None:
-    problem, fitted, none = Lines(), np.arange(18), np.zeros(1)
-    setup = Setup(problem, fitted, np.arange(18, 24), fitted // 3, fit(problem, [], [], fitted), none, none)
-    scatter, plain = 0.01 * np.random.default_rng(0).normal(size=24), motion(problem)
-    base = judge_fit(setup, setup.baseline)._replace(errors=4.0 + scatter)
-    a, b = (judge_fit(setup, fit(problem, [term(x)], [np.ones(1)], fitted)) for x in "ab")
-    a, b = a._replace(errors=0.5 + scatter), b._replace(errors=1.0 + scatter)
-
-    def predict(fits: Sequence[Fit]) -> np.ndarray:
-        y = plain.predict(fits)
-        for own, f in zip(y, fits, strict=True):
-            own[20, -1] += 1e6 * any(t.effect == "a" for t in f.terms)  # one sample of one window
-        return y
-
-    def named(tolerance: Tolerance) -> list[str]:
-        return reach_verdict(setup, [base, a, b], None, np.random.default_rng(0), tolerance).there.names
-
-    assert named(plain) == ["a"] and named(replace(plain, predict=predict)) == ["b"]
 
 
 @pytest.mark.parametrize(
