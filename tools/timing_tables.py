@@ -21,6 +21,9 @@ def timing() -> str:
     ways = {"size": "size", "critics": "members", "one by one [ms]": "loop_ms", "as one product [ms]": "batched_ms"}
     critics = pick(read("timing/time_ensemble.csv"), ways)
     parts += ["The least time that arithmetic and memory leave:", least, "Critics in an update:", critics]
+    compiled = {"size": "size", "precision": "precision", "as it is [ms]": "plain_ms", "compiled [ms]": "compiled_ms"}
+    compiled |= {"to the former": "to_plain", "compiling [s]": "compile_s", "pays after": "pays_after"}
+    parts += ["Updates with compiled networks:", pick(read("timing/time_compile.csv"), compiled)]
     profile = {name: name for name in ("size", "precision", "operation", "ms", "calls")}
     large = [row for row in read("timing/profile_update.csv") if float(row["share"]) >= 0.03]
     shares = pick(large, {**profile, "share": ("share", percent)})

@@ -84,14 +84,19 @@ def flop(call: Callable[[], object]) -> int:
     return int(counted.get_total_flops())
 
 
-def jobs(size: str, precision: str, many: bool) -> list[tuple[str, int, float, int, Callable[[], object]]]:
-    """(what, horizon, decay, rows, call) of all that is timed for a model; `many` plans 100 environments too."""
+def agent_of(size: str, precision: str) -> Agent:
+    """A new agent with a model of this size; every update of it has every part, as upstream's."""
     obs_dim, action_dim = SPACES.get(size, UPSTREAM)
     sizes = {"obs_dim": obs_dim, "action_dim": action_dim, "decode_dim": min(obs_dim, 12)}
     model: WorldModel = instantiate(OmegaConf.load(ROOT / f"configs/model/{size}.yaml"), **sizes)
     train = OmegaConf.load(ROOT / "configs/train/default.yaml")
-    whole = {"policy_delay": 1}  # every update has every part, as upstream's
-    agent: Agent = instantiate(train.agent, model=model, discount=0.99, precision=precision, **whole)
+    return instantiate(train.agent, model=model, discount=0.99, precision=precision, policy_delay=1)
+
+
+def jobs(size: str, precision: str, many: bool) -> list[tuple[str, int, float, int, Callable[[], object]]]:
+    """(what, horizon, decay, rows, call) of all that is timed for a model; `many` plans 100 environments too."""
+    agent, (obs_dim, action_dim) = agent_of(size, precision), SPACES.get(size, UPSTREAM)
+    model = agent.model
     out: list[tuple[str, int, float, int, Callable[[], object]]] = []
     for horizon in (3, 4):
         for decay in DECAYS if horizon == 4 else (1.0,):
