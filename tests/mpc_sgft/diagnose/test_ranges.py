@@ -14,7 +14,7 @@ from mpc_sgft.diagnose.deployments.ranges import find_ranges, randomisation
 from mpc_sgft.diagnose.deployments.recordings import read_deployment
 
 
-ON_ICE = {  # weak in nothing, late by 0.1 s; factors: friction 0.8, mass 1.6
+ON_ICE: dict[str, dict] = {  # weak in nothing, late by 0.1 s; factors: friction 0.8, mass 1.6
     "actuator_delay": {"delay": 0.1},
     "contact_friction": {"coefficient": 0.32, "at": ["puck"]},
     "payload": {"mass": 0.06, "at": ["puck"]},
@@ -30,7 +30,7 @@ def test_a_late_machine_is_found_among_the_draws(deployed) -> None:
     assert draws["friction"]["high"] < 0.9, draws["friction"]
 
 
-@pytest.mark.xfail(reason="mass and friction are not told for certain: it depends on the seed, and on the processor")
+@pytest.mark.xfail(reason="mass and friction are not told for certain: seed and processor decide")
 def test_a_late_machine_on_ice_is_found_among_the_draws(deployed) -> None:
     run = deployed(ON_ICE, episodes=6)
     found = find_ranges(read_deployment(run), randomisation(run, "push"), seed=0, rounds=5, samples=24)
