@@ -13,7 +13,6 @@ from mpc_sgft.diagnose.__main__ import main
 from mpc_sgft.diagnose.deployments.ranges import find_ranges, randomisation
 from mpc_sgft.diagnose.deployments.recordings import read_deployment
 
-
 ON_ICE: dict[str, dict] = {  # weak in nothing, late by 0.1 s; factors: friction 0.8, mass 1.6
     "actuator_delay": {"delay": 0.1},
     "contact_friction": {"coefficient": 0.32, "at": ["puck"]},
