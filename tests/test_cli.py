@@ -37,6 +37,9 @@ def loops(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         "from mpc_sgft.command.errors import Stopped\n"
         "def folder(cfg):\n    print(run_folder.start(cfg))\n"
         "def show(cfg):\n    print(cfg.seed, cfg.chosen.gap, cfg.planner.horizon)\n"
+        "def compose_anew(cfg):\n"
+        "    from mpc_sgft.command.compose import compose\n"
+        "    print(cfg.seed, compose('pretrain', ['seed=7'], []).seed)\n"
         "def stop(cfg):\n    raise Stopped('Saved. Go on with: --resume runs/x')\n"
         "def full(cfg):\n    raise OSError(errno.ENOSPC, 'No space left on device', 'runs/x/metrics.csv')\n"
         "def garbage(cfg):\n    print(imported, gc.isenabled(), gc.get_freeze_count() > 0)\n"
@@ -162,6 +165,12 @@ def test_a_sweep_runs_each_value(loops: Path, capfd) -> None:
     out = capfd.readouterr().out
     assert "1 none 1" in out and "2 none 1" in out
     assert [path.name for path in loops.iterdir()] == ["runs"]
+
+
+def test_a_job_of_a_sweep_composes_for_itself(loops: Path, capfd) -> None:
+    assert cli.run(probe("compose_anew"), ["seed=1,2", "-m"]) == 0
+    out = capfd.readouterr().out
+    assert "1 7" in out and "2 7" in out
 
 
 def test_a_sweep_passes_hydras_own_errors_on(loops: Path, capsys) -> None:

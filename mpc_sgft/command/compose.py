@@ -11,6 +11,7 @@ from typing import Any
 
 from hydra import compose as hydra_compose
 from hydra import initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
@@ -247,11 +248,15 @@ def first_line(err: BaseException) -> str:
 
 
 def _compose(name: str, overrides: Sequence[str]) -> DictConfig:
+    sweep = GlobalHydra.instance().hydra  # a job of a sweep composes while Hydra runs it
+    GlobalHydra.instance().clear()
     try:
         with initialize_config_dir(version_base="1.3", config_dir=str(choices.CONFIG_DIR), job_name=name):
             return hydra_compose(config_name=name, overrides=list(overrides), return_hydra_config=True)
     except (HydraException, OmegaConfBaseException) as err:
         raise UserError(first_line(err)) from err
+    finally:
+        GlobalHydra.instance().hydra = sweep
 
 
 def _contents(group: str, path: str) -> list[tuple[str, Any]]:

@@ -25,10 +25,11 @@ def test_a_run_is_made_once_and_resumed_if_cut_off(tmp_path):
 def test_a_launcher_starts_a_run_elsewhere(tmp_path):
     """submitit's own local executor: a process of its own, as on a cluster that runs SLURM."""
     pytest.importorskip("hydra_plugins.hydra_submitit_launcher", reason="needs submitit")
-    run, launcher = tmp_path / "run", "submitit_local"
-    words = ["policy=scripted", "episodes=2", "hydra.launcher.timeout_min=2"]
-    assert finished("evaluate", run, words, launcher)["success"] == 1.0
+    run, launcher, minutes = tmp_path / "run", "submitit_local", "hydra.launcher.timeout_min=4"
+    learns = ["gap=turned", "rollouts=1", "eval_episodes=2", "log.rerun=false", minutes]
+    assert finished("deploy", run, learns, launcher)["updates"] > 0
     assert list((tmp_path / "run.sweep" / ".submitit").glob("*/*_log.out"))
+    words = ["policy=scripted", "episodes=2", minutes]
     with pytest.raises(RunFailed, match="error: No checkpoint at /nowhere"):
         finished("evaluate", tmp_path / "bad", ["checkpoint=/nowhere/at/all", "episodes=2"], launcher)
     (tmp_path / "begun").mkdir()
