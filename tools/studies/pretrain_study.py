@@ -14,6 +14,8 @@ from tools.studies.runner import each, finished, write
 
 COLUMNS = "task seed transitions updates episodes_evaluated success success_low success_high prior_success".split()
 COLUMNS += ["wall_seconds"]
+PARTS = ("update", "wait", "evaluate", "save")  # of the seconds: learning, waiting for episodes, and so on
+PROCESSES = ("learner", "collector")  # whose most memory is told; workers of a Ray cluster are not its children
 
 
 def main() -> None:
@@ -33,11 +35,14 @@ def main() -> None:
         overrides = [f"task={args.task}", f"seed={seed}", *args.set]
         result = finished("pretrain", args.runs / f"{args.task}-{seed}", overrides, args.launcher)
         low, high = result["success_interval"]
-        return result | {"success_low": round(low, 3), "success_high": round(high, 3)}
+        parts = {f"{part}_seconds": result["seconds"][part] for part in PARTS}
+        parts |= {f"{name}_mb": result["peak_memory_mb"][name] for name in PROCESSES}
+        return result | {"success_low": round(low, 3), "success_high": round(high, 3)} | parts
 
     found, failed = each(args.seeds, work, args.jobs)
     machine = {"jobs": args.jobs, "cpu": cpu_name()}
-    write(args.csv, [*COLUMNS, *machine], [r | machine for r in found])
+    more = [*(f"{part}_seconds" for part in PARTS), *(f"{name}_mb" for name in PROCESSES)]
+    write(args.csv, [*COLUMNS, *more, *machine], [r | machine for r in found])
     if failed:
         sys.exit(f"{failed} of {len(args.seeds)} runs failed")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import os
 import signal
 import socket
@@ -106,6 +107,35 @@ def test_a_cluster_that_is_there_is_joined_and_left_as_it_was(tmp_path: Path) ->
         finally:
             head.stdin.close()
         assert head.wait(timeout=60) == 0
+
+
+def test_a_pretraining_that_loses_a_worker_learns_the_same(tmp_path: Path) -> None:
+    """One worker is killed in the middle; every number is that of a run in processes of this machine."""
+    words = ["task=pendulum", "+experiment=debug", "transitions=3000", "collector.workers=2", "log.tensorboard=false"]
+    quiet = os.environ | {"OMP_NUM_THREADS": "1"}
+
+    def start(kind: str) -> subprocess.Popen[str]:
+        own = [f"collector={kind}", f"run_dir={tmp_path / kind}"]
+        line = [sys.executable, "-m", "mpc_sgft.pretrain", "--quiet", *words, *own]
+        return subprocess.Popen(line, stderr=subprocess.PIPE, text=True, env=quiet)
+
+    with start("process") as expected:
+        assert expected.wait(timeout=120) == 0
+    metrics, deadline = tmp_path / "ray" / "metrics.csv", time.monotonic() + 120
+    with start("ray") as run:
+        while not (metrics.exists() and len(metrics.read_text().splitlines()) > 2):
+            assert time.monotonic() < deadline and run.poll() is None
+            time.sleep(0.05)
+        workers_of(psutil.Process(run.pid))[0].kill()
+        _, error = run.communicate(timeout=120)
+        assert run.returncode == 0, error
+    numbers = [_without_seconds(tmp_path / kind / "metrics.csv") for kind in ("process", "ray")]
+    assert numbers[0] == numbers[1] and len(numbers[0]) > 3
+
+
+def _without_seconds(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="") as file:
+        return [{name: text for name, text in row.items() if name != "seconds"} for row in csv.DictReader(file)]
 
 
 def test_what_is_no_address_is_refused(agent) -> None:
