@@ -13,9 +13,9 @@ from mpc_sgft.storage.run_folder import cpu_name
 from tools.studies.runner import each, finished, write
 
 COLUMNS = "task seed transitions updates episodes_evaluated success success_low success_high prior_success".split()
-COLUMNS += ["wall_seconds"]
-PARTS = ("update", "wait", "evaluate", "save")  # of the seconds: learning, waiting for episodes, and so on
-PROCESSES = ("learner", "collector")  # whose most memory is told; workers of a Ray cluster are not its children
+PARTS = ("update", "wait", "evaluate", "save")  # where the seconds went: learning, waiting for episodes, and so on
+PROCESSES = ("learner", "collector")  # the most memory that each held; the workers of a Ray cluster are no collector
+COLUMNS += ["wall_seconds", *(f"{part}_seconds" for part in PARTS), *(f"{name}_mb" for name in PROCESSES)]
 
 
 def main() -> None:
@@ -41,8 +41,7 @@ def main() -> None:
 
     found, failed = each(args.seeds, work, args.jobs)
     machine = {"jobs": args.jobs, "cpu": cpu_name()}
-    more = [*(f"{part}_seconds" for part in PARTS), *(f"{name}_mb" for name in PROCESSES)]
-    write(args.csv, [*COLUMNS, *more, *machine], [r | machine for r in found])
+    write(args.csv, [*COLUMNS, *machine], [r | machine for r in found])
     if failed:
         sys.exit(f"{failed} of {len(args.seeds)} runs failed")
 
