@@ -4,8 +4,9 @@
         skate=runs/skate --variants "" planner.precision=bfloat16 planner.iterations=2
 
 `--runs` names gaps and the run folder or checkpoint that plans there; SHIPPED is the checkpoint of the package. Regret
-is the return of the wide search's plan less that of the variant's, both valued in float32 on latents that the plain
-search visits. A row that is in the CSV is not measured again.
+is the return of a plan of `--reference`, the configured search unless given, with ten times its candidates, less that
+of the variant's, both valued in float32 on latents that the configured search visits. A row that is in the CSV is not
+measured again.
 """
 
 import argparse
@@ -54,15 +55,15 @@ def latents(cfg: DictConfig, model: WorldModel, count: int = 100) -> Tensor:
 
 
 @torch.inference_mode()
-def regret(cfg: DictConfig, plain: DictConfig, model: WorldModel, z: Tensor) -> tuple[float, float]:
+def regret(cfg: DictConfig, reference: DictConfig, model: WorldModel, z: Tensor) -> tuple[float, float]:
     """Mean return that the wide search finds beyond this one, and the returns' standard deviation, reward units."""
-    wide = plain.copy()
+    wide = reference.copy()
     for name in ("num_candidates", "num_prior", "num_elites"):
-        wide.planner[name] = WIDER * plain.planner[name]
+        wide.planner[name] = WIDER * reference.planner[name]
     found = []
     for search in (wide, cfg):
         plan = make_planner(search, model.action_dim).plan(model, z, None, None, torch.Generator().manual_seed(SEED))
-        found.append(h_step_return(model, z, plan.mean.unsqueeze(1), plain.task.discount).squeeze(1))
+        found.append(h_step_return(model, z, plan.mean.unsqueeze(1), reference.task.discount).squeeze(1))
     return float((found[0] - found[1]).mean()), float(found[0].std())
 
 
@@ -81,6 +82,7 @@ def main() -> None:
     parser.add_argument("csv", type=Path)
     parser.add_argument("--runs", nargs="+", required=True, metavar="gap=RUN")
     parser.add_argument("--variants", nargs="+", default=[""], metavar="'name=value ...'", help="'' as it is")
+    parser.add_argument("--reference", default="", metavar="'name=value ...'", help="whose search, widened, is best")
     parser.add_argument("--episodes", type=int, default=200)
     args = parser.parse_args()
     runs = dict(text.split("=", 1) for text in args.runs)
@@ -90,7 +92,7 @@ def main() -> None:
         prepare_process(cfg)
         model = load_agent(cfg).model
         z = latents(plain, model)
-        behind, spread = regret(cfg, plain, model, z)
+        behind, spread = regret(cfg, config(gap, runs[gap], args.reference), model, z)
         env = make_env(cfg, args.episodes)
         result = score(
             collect(env, planner_policy(model, make_planner(cfg, model.action_dim), SEED + 1), seed=SEED + 1)
