@@ -6,15 +6,50 @@ from torch import Tensor, nn
 from mpc_sgft.learning.layers import mlp, simnorm
 
 
+class CommandMap(nn.Linear):
+    """What a machine makes of its commands u [..., K]: each c_i of W u + b, brought nearer to zero by a dead band d_i.
+
+        c' = c - d sign(c) where |c| > d, else 0
+
+    Starts as the identity; until `add_band` d is zero. Where it is learned and falls below zero, c' is larger than c.
+
+    Args:
+        inputs: K, the entries of this command and those before it, newest first.
+        outputs: Entries of a command [A].
+    """
+
+    def __init__(self, inputs: int, outputs: int) -> None:
+        super().__init__(inputs, outputs)
+        nn.init.eye_(self.weight)
+        nn.init.zeros_(self.bias)
+        self.band: nn.Parameter | None = None
+
+    def add_band(self) -> None:
+        """Learn the dead band of each entry too, from zero on; nothing where it is learned already."""
+        if self.band is None:
+            self.band = nn.Parameter(torch.zeros_like(self.bias))
+
+    def forward(self, input: Tensor) -> Tensor:
+        c = super().forward(input)
+        return c if self.band is None else torch.where(c.abs() > self.band, c - self.band * c.sign(), 0.0)
+
+    def change(self) -> Tensor:
+        """Sum of the absolute differences of all numbers from those it started with, scalar."""
+        numbers = [self.weight - torch.eye(*self.weight.shape, device=self.weight.device), self.bias]
+        numbers += [] if self.band is None else [self.band]
+        return torch.stack([x.abs().sum() for x in numbers]).sum()
+
+
 class Dynamics(nn.Module):
     """Latent dynamics. A latent z = [s, m] is a code s [D] and the last commands m, newest first [M].
 
-        c_i = sum_j W_j u_{i+j} + b for each command u_i of u = [a, m]   what the machine makes of its commands
+        c_i = map(u_i, u_{i+1}, ...) for each command u_i of u = [a, m]   what the machine makes of its commands
         s'  = SimNorm(f(s, c) [+ residual(s, c)])
         m'  = [a, m without its last command]                            exact, so only s' is learned
 
-    Until `add_command_map` c is u. From then on W and b are learned, from the identity on: a gain, a rotation, a drift,
-    a delay, a lag, a few numbers that hold wherever the robot is. Commands older than the memory count as its oldest.
+    Until `add_command_map` c is u. From then on a `CommandMap` is learned, from the identity on: a gain, a rotation, a
+    drift, a delay, a lag, a dead band, a few numbers that hold wherever the robot is. Commands older than the memory
+    count as its oldest.
     `add_residual` adds a correction that starts at zero.
     """
 
@@ -23,7 +58,7 @@ class Dynamics(nn.Module):
         inputs = code_dim + memory_dim + action_dim
         self.base = mlp([inputs, mlp_dim, mlp_dim, code_dim], out=nn.Identity())  # ends in LayerNorm
         self.residual: nn.Module | None = None
-        self.command: nn.Linear | None = None
+        self.command: CommandMap | None = None
         self.code_dim, self.memory_dim, self.simnorm_dim = code_dim, memory_dim, simnorm_dim
 
     def forward(self, z: Tensor, action: Tensor) -> Tensor:
@@ -42,12 +77,6 @@ class Dynamics(nn.Module):
         longest = self.command.in_features // self.command.out_features
         window = (lag[:, None] + torch.arange(longest, device=commands.device)).clamp(max=len(lag) - 1)
         return self.command(each[..., window, :].flatten(-2)).flatten(-2)
-
-    def command_change(self) -> Tensor:
-        """Sum of the absolute differences of the command map from the identity, scalar."""
-        assert self.command is not None, "there is no command map"
-        weight, bias = self.command.weight, self.command.bias
-        return (weight - torch.eye(*weight.shape, device=weight.device)).abs().sum() + bias.abs().sum()
 
     def as_simulated(self, z: Tensor) -> Tensor:
         """The latent with its commands as the machine realised them: what the simulator would have called them."""

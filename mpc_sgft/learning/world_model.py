@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor, nn
 
-from mpc_sgft.learning.dynamics import Dynamics
+from mpc_sgft.learning.dynamics import CommandMap, Dynamics
 from mpc_sgft.learning.gaussian import gaussian_tanh, gaussian_tanh_log_prob
 from mpc_sgft.learning.layers import (
     Ensemble,
@@ -277,9 +277,7 @@ class WorldModel(nn.Module):
         """
         if self.dynamics.command is not None:
             raise ValueError("The dynamics already have a command map; add_command_map works once.")
-        command = nn.Linear(self.action_dim + self.memory_dim, self.action_dim)
-        command.weight.copy_(torch.eye(self.action_dim, self.action_dim + self.memory_dim))
-        command.bias.zero_()
+        command = CommandMap(self.action_dim + self.memory_dim, self.action_dim)
         self.dynamics.command = command.to(next(self.parameters()).device)
 
     @torch.no_grad()

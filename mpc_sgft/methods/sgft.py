@@ -39,6 +39,7 @@ class SGFT(AbstractMethod):
             from the identity.
         residual: Train a correction that starts at zero on top of frozen pretrained dynamics.
         command_map: Also learn what the machine makes of a command, a few numbers that hold everywhere.
+        command_band: With a command map, also how small a command of each entry does nothing.
         command_sparsity: Weight of the sum of their absolute differences from the identity, divided by the rollouts so
             far: what is wrong with a machine is mostly one thing (the lasso: Tibshirani, JRSS B 1996).
         observation_map: Also learn what the sensors should have said: a turn of what a camera sees, a shift of each
@@ -49,7 +50,8 @@ class SGFT(AbstractMethod):
         updates, slice_len, action_noise, average_decay, policy_share: As in `AbstractMethod`.
 
     Raises:
-        ValueError: If the horizon is not positive, rho lies outside (0, 1], or gate_excess is negative.
+        ValueError: If the horizon is not positive, rho lies outside (0, 1], gate_excess is negative, or command_band
+            is asked for without a command map.
 
     Source: Yin, Westenbroek et al., ICLR 2025.
     """
@@ -66,6 +68,7 @@ class SGFT(AbstractMethod):
         anchor: float,
         residual: bool,
         command_map: bool,
+        command_band: bool,
         command_sparsity: float,
         observation_map: bool,
         observation_lr: float,
@@ -84,9 +87,12 @@ class SGFT(AbstractMethod):
         check_objective(horizon, rho)
         if gate_excess < 0:
             raise ValueError(f"gate_excess={gate_excess} must be 0 or more.")
+        if command_band and not command_map:
+            raise ValueError("command_band=true is part of the command map: set command_map=true, or leave it out.")
         self.horizon, self.lr, self.policy_lr, self.command_lr = horizon, lr, policy_lr, command_lr
         self.entropy_coef, self.rho, self.anchor = entropy_coef, rho, anchor
-        self.residual, self.command_map, self.command_sparsity = residual, command_map, command_sparsity
+        self.residual, self.command_map, self.command_band = residual, command_map, command_band
+        self.command_sparsity = command_sparsity
         self.gate = Gate(gate_margin, gate_memory, gate_excess) if gate else None
         self.updates, self.slice_len, self.action_noise = updates, slice_len, action_noise
         self.observation_map, self.observation_lr, self.start_weight = observation_map, observation_lr, start_weight
@@ -103,6 +109,8 @@ class SGFT(AbstractMethod):
         if self.command_map:
             if model.dynamics.command is None:
                 model.add_command_map()
+            if self.command_band and model.dynamics.command is not None:
+                model.dynamics.command.add_band()
             parts += ("dynamics.command",)
         if self.observation_map:
             if model.observation_map is None:
@@ -148,7 +156,7 @@ class SGFT(AbstractMethod):
         penalties: tuple[Penalty, ...] = ()
         if commands is not None and self.command_sparsity:
             share = self.command_sparsity / len(starts)
-            penalties += (Penalty("command_change", share, self._simulated.command_change),)
+            penalties += (Penalty("command_change", share, commands.change),)
         if sensors is None:
             return Maps(parts, self._simulated, penalties)
         simulated = self._sensed.starts.to(starts.device)

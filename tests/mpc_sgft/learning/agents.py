@@ -34,7 +34,13 @@ SHARED = dict(slice_len=3, action_noise=0.0)
 NO_GATE = dict(gate=False, gate_margin=0.9, gate_memory=5)
 OURS = dict(gate_excess=0.0, anchor=0.0, residual=False, command_map=False, command_sparsity=0.0, command_lr=2e-2)
 OURS |= dict(
-    observation_map=False, observation_lr=5e-3, start_weight=1.0, lr_decay=0.0, average_decay=0.0, policy_share=1.0
+    command_band=False,
+    observation_map=False,
+    observation_lr=5e-3,
+    start_weight=1.0,
+    lr_decay=0.0,
+    average_decay=0.0,
+    policy_share=1.0,
 )
 SENSED = Sensed(("tip_x", "tip_y", "height"), torch.zeros(2, 3))
 SGFT_NUMBERS = dict(

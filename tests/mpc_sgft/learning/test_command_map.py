@@ -6,12 +6,26 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from mpc_sgft.learning.dynamics import CommandMap
 from mpc_sgft.learning.fit import Maps, Penalty, fit_dynamics
 from mpc_sgft.learning.slices import Slices
+from mpc_sgft.learning.world_model import WorldModel
 from tests.mpc_sgft.learning.agents import hand_over, make_agent
 
 A, T, B = 2, 4, 64
 TRUTH = torch.tensor([[0.5, -0.3], [0.3, 0.5]])  # half of the command, turned
+
+
+def transitions(machine: WorldModel, generator: torch.Generator) -> TensorDict:
+    """A batch [B, T] of what a machine does with random commands; latents stand for observations."""
+    action = 2 * torch.rand(T, B, A, generator=generator) - 1
+    z = [torch.cat([torch.rand(B, 16, generator=generator), 2 * torch.rand(B, 2 * A, generator=generator) - 1], 1)]
+    for a in action:
+        z.append(machine.dynamics(z[-1], a))
+    seen, nothing = torch.stack(z).transpose(0, 1), torch.zeros(B, T, 1)
+    following = {"observation": seen[:, 1:], "reward": nothing, "terminated": nothing.bool()}
+    batch = {"observation": seen[:, :-1], "action": action.transpose(0, 1), "next": TensorDict(following, [B, T])}
+    return TensorDict(batch, [B, T])
 
 
 def taught(agent, simulated: bool, updates: int = 300):
@@ -52,12 +66,61 @@ def test_a_turned_gain_is_found_and_the_dynamics_stay(simulated: bool) -> None:
 def test_the_change_is_the_sum_of_absolute_differences() -> None:
     dynamics = make_agent(sizes={"obs_dim": 6 + 2 * A, "memory_dim": 2 * A}).model
     dynamics.add_command_map()
-    assert dynamics.dynamics.command_change() == 0
+    assert dynamics.dynamics.command.change() == 0
     with torch.no_grad():
         dynamics.dynamics.command.weight[0, 0] = 0.5
         dynamics.dynamics.command.weight[1, 3] = -0.25
         dynamics.dynamics.command.bias[1] = 2.0
-    assert dynamics.dynamics.command_change() == 2.75
+    assert dynamics.dynamics.command.change() == 2.75
+
+
+def test_a_dead_band_brings_commands_nearer_to_zero() -> None:
+    command = CommandMap(4, 2)
+    assert command(torch.tensor([0.1, -0.7, 9.0, 9.0])).tolist() == pytest.approx([0.1, -0.7])
+    command.add_band()
+    with torch.no_grad():
+        command.weight[0, 2] = 0.5
+        command.band[:] = torch.tensor([0.4, 0.25])
+    sent = torch.tensor([[0.3, -0.7, 0.0, 9.0], [-0.3, 0.2, 0.0, 9.0], [0.3, 0.25, 1.0, 9.0]])
+    assert command(sent).flatten().tolist() == pytest.approx([0.0, -0.45, 0.0, 0.0, 0.4, 0.0])
+    assert command.change().item() == pytest.approx(0.5 + 0.4 + 0.25)
+    command.add_band()  # is there already
+    assert command.band.tolist() == pytest.approx([0.4, 0.25])
+
+
+@pytest.mark.parametrize("band", [True, False])
+def test_a_threshold_is_told_from_a_weak_arm(band: bool) -> None:
+    """A machine that gives 0.9 of a command and does nothing with a small one; a gain alone passes for weakness."""
+    agent = make_agent(sizes={"obs_dim": 6 + 2 * A, "memory_dim": 2 * A})
+    torch.nn.init.orthogonal_(agent.model.dynamics.base[-1].linear.weight)
+    machine = copy.deepcopy(agent.model)
+    machine.add_command_map()
+    machine.dynamics.command.add_band()
+    machine.requires_grad_(False)
+    machine.dynamics.command.weight.mul_(0.9)
+    machine.dynamics.command.band.fill_(0.35)
+    update = hand_over(agent, command_map=True, command_band=band, slice_len=T, lr=1e-6)
+    agent.model.encode = lambda z: z  # latents in place of observations
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(400):
+        update(transitions(machine, generator))
+    command = agent.model.dynamics.command
+    gains = command.weight[:, :A].diagonal()
+    if band:
+        assert (command.band - 0.35).abs().max() < 0.03 and (gains - 0.9).abs().max() < 0.05
+    else:
+        assert command.band is None and gains.max() < 0.75
+
+
+def test_a_later_deployment_may_ask_for_a_band() -> None:
+    agent = make_agent(sizes={"obs_dim": 6 + 2 * A, "memory_dim": 2 * A})
+    hand_over(agent, command_map=True)
+    assert agent.model.dynamics.command.band is None
+    hand_over(agent, command_map=True, command_band=True)
+    trained = [id(p) for p in agent.optimizers.trained]
+    assert id(agent.model.dynamics.command.band) in trained
+    with pytest.raises(ValueError, match="command_band=true is part of the command map"):
+        hand_over(agent, command_map=False, command_band=True)
 
 
 @pytest.mark.parametrize("weight", [0.0, 1e-4])
@@ -80,7 +143,7 @@ def test_few_causes_are_preferred_where_commands_look_alike(weight: float) -> No
         z.append(machine(z[-1], a))
     seen = torch.stack(z) + 0.05 * torch.cat([torch.randn(T + 1, B, 16), torch.zeros(T + 1, B, 2 * A)], -1)
     data = Slices(seen, action, torch.zeros(T, B), torch.zeros(T, B, dtype=torch.bool))
-    sparse = (Penalty("command_change", weight, own.command_change),)
+    sparse = (Penalty("command_change", weight, own.command.change),)
     for _ in range(500):
         fit_dynamics(agent, data, rho=1.0, maps=Maps((own.command,), own, sparse))
     off = (dynamics.command.weight - machine.command.weight).abs().max()
@@ -101,14 +164,7 @@ def test_tdmpc2_may_be_given_a_command_map(mapped: bool) -> None:
     agent.model.encode = lambda z: z  # latents in place of observations
     generator, errors = torch.Generator().manual_seed(0), []
     for _ in range(300):
-        action = 2 * torch.rand(T, B, A, generator=generator) - 1
-        z = [torch.cat([torch.rand(B, 16, generator=generator), 2 * torch.rand(B, 2 * A, generator=generator) - 1], 1)]
-        for a in action:
-            z.append(machine.dynamics(z[-1], a))
-        seen, nothing = torch.stack(z).transpose(0, 1), torch.zeros(B, T, 1)
-        following = {"observation": seen[:, 1:], "reward": nothing, "terminated": nothing.bool()}
-        batch = {"observation": seen[:, :-1], "action": action.transpose(0, 1), "next": TensorDict(following, [B, T])}
-        errors.append(update(TensorDict(batch, [B, T]))["consistency_loss"])
+        errors.append(update(transitions(machine, generator))["consistency_loss"])
     assert (errors[-1] < 0.1 * errors[0]) == mapped
     if mapped:
         assert (agent.model.dynamics.command.weight[:, :A] - TRUTH).abs().max() < 0.05

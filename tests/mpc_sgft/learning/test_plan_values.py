@@ -17,12 +17,14 @@ from tests.host_reads import NoWaiting
 CPU = torch.device("cpu")
 
 
-def model_with(*, memory: int, reward_from: str = "next", command: bool = False, residual: bool = False) -> WorldModel:
+def model_with(*, memory: int, reward_from: str = "next", command: str = "", residual: bool = False) -> WorldModel:
     torch.manual_seed(3)
     sizes = {"obs_dim": 14, "action_dim": 2, "decode_dim": 5, "latent_dim": 32, "mlp_dim": 48, "enc_dim": 16}
     model = WorldModel(**sizes, num_q=2, memory_dim=memory, reward_from=reward_from, vmin=-3, vmax=3).eval()
     if command:
         model.add_command_map()
+    if command == "band":
+        model.dynamics.command.add_band()
     if residual:
         model.add_residual(16)
     with torch.no_grad():
@@ -33,9 +35,9 @@ def model_with(*, memory: int, reward_from: str = "next", command: bool = False,
 
 @pytest.mark.parametrize("reward_from", ["next", "current"])
 @pytest.mark.parametrize("memory", [0, 6])
-@pytest.mark.parametrize(("command", "residual"), [(False, False), (True, False), (True, True)])
+@pytest.mark.parametrize(("command", "residual"), [("", False), ("map", False), ("map", True), ("band", False)])
 @torch.inference_mode()
-def test_values_are_the_h_step_return(reward_from: str, memory: int, command: bool, residual: bool) -> None:
+def test_values_are_the_h_step_return(reward_from: str, memory: int, command: str, residual: bool) -> None:
     model = model_with(memory=memory, reward_from=reward_from, command=command, residual=residual)
     z, plans = model.encode(torch.randn(3, 14)), torch.rand(3, 50, 4, 2) * 2 - 1
     exact = h_step_return(model, z, plans, 0.9)

@@ -16,7 +16,7 @@ SIZES = dict(obs_dim=6, action_dim=2, decode_dim=3, latent_dim=16, mlp_dim=32, e
 CFG = OmegaConf.create({"chosen": {"task": "push"}, "task": {"history": 2, "discount": 0.99}, "train": {"lr": 3e-4}})
 
 
-def saved(path, residual=False):
+def saved(path, residual=False, band=False):
     torch.manual_seed(0)
     model = WorldModel(**SIZES)
     model.normalizer.update(torch.randn(20, 6))
@@ -24,13 +24,17 @@ def saved(path, residual=False):
     if residual:
         model.add_residual()
         torch.nn.init.normal_(model.dynamics.residual[-1].weight)
+    if band:
+        model.add_command_map()
+        model.dynamics.command.add_band()
+        torch.nn.init.uniform_(model.dynamics.command.band)
     checkpoint.save(path, model, checkpoint.describe(CFG, model, extra={"transitions": 7}))
     return model
 
 
-@pytest.mark.parametrize("residual", [False, True])
-def test_a_model_comes_back_bit_for_bit_with_its_header(tmp_path, residual):
-    model = saved(tmp_path / "model.safetensors", residual)
+@pytest.mark.parametrize(("residual", "band"), [(False, False), (True, False), (False, True)])
+def test_a_model_comes_back_bit_for_bit_with_its_header(tmp_path, residual, band):
+    model = saved(tmp_path / "model.safetensors", residual, band)
     loaded, meta = checkpoint.load(tmp_path / "model.safetensors", tasks=["edge", "push"], sizes={"obs_dim": 6})
     for (name, a), (other, b) in zip(model.state_dict().items(), loaded.state_dict().items(), strict=True):
         assert name == other and torch.equal(a, b)
