@@ -5,6 +5,9 @@ from collections.abc import Callable
 from tools.tables import percent, pick, read, table, tenth
 
 
+TRIED = "Searches that stop early, or follow the spread of plans, and are not used:"
+
+
 def timing() -> str:
     plan = {name: name for name in ("what", "size", "precision", "horizon", "decay", "rows", "threads")}
     plan = {**plan, "median ms": "median_ms", "share of peak": "share_of_peak", "to upstream": "ratio_to_upstream"}
@@ -75,9 +78,10 @@ def quality() -> str:
     head |= {"success": ("success", tenth), "low": ("success_low", tenth), "high": ("success_high", tenth)}
     head |= {"regret": "regret", "spread": "spread", "ms": "plan_ms"}
     parts = []
-    for file in ("plan_quality", "decay"):
+    for file, says in (("plan_quality", ""), ("decay", ""), ("early", TRIED), ("early_wide", "A wide search:")):
         rows = [{**r, "variant": r["variant"] or "as configured"} for r in read(f"plan_quality/{file}.csv")]
-        parts.append(pick(rows, head))
+        parts += [says, pick(rows, head)]
+    parts.append(pick(read("plan_quality/early_time.csv"), {"gap": "gap", "search": "variant", "time": "ratio"}))
     return "\n\n".join(parts)
 
 
