@@ -24,7 +24,9 @@ def pretrain() -> str:
         for name, file in (("From scratch:", "pretrain"), ("The second stage (`+experiment=polish`):", "polish"))
     ]
     rounded = {"model": "model", "updates in": "precision"} | {k: v for k, v in head.items() if k in ROUNDED}
-    return "\n\n".join([*parts, "A wide model:", pick(read("pretrain/precision.csv"), rounded | {"return": "return"})])
+    parts += ["A wide model:", pick(read("pretrain/precision.csv"), rounded | {"return": "return"})]
+    own = {k: v for k, v in head.items() if k != "minutes"} | {"learner's memory [MB]": "learner_mb"}
+    return "\n\n".join([*parts, "Collected on a Ray cluster:", pick(read("pretrain/ray.csv"), own)])
 
 
 def transfer() -> str:

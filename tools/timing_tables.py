@@ -4,7 +4,6 @@ from collections.abc import Callable
 
 from tools.tables import percent, pick, read, table, tenth
 
-
 TRIED = "Searches that stop early, or follow the spread of plans, and are not used:"
 
 
