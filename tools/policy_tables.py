@@ -109,6 +109,14 @@ def method_in_gap(row: Row) -> str:
     return f"`{row['gap']}`, {row['method']}"
 
 
+def outside() -> str:
+    def way(row: Row) -> str:
+        return f"`{row['gap']}`, {'with a dead band' if row['variant'] else 'without'}"
+
+    later = curves(read("outside/band.csv"), way, "gap, command map")
+    return f"{curves(read('outside/sgft.csv'), method_in_gap, 'gap and method')}\n\nLater:\n\n{later}"
+
+
 def audit() -> str:
     (found,) = read("audit/auc.csv")
     area = f"{percent(found['auc'])} [{percent(found['low'])}, {percent(found['high'])}]"

@@ -32,7 +32,7 @@ def records(*paths: str) -> str:
 STUDIES: dict[str, Callable[[], str]] = {
     "pretrain": policy_tables.pretrain,
     "transfer": policy_tables.transfer,
-    "outside": lambda: curves(read("outside/sgft.csv"), policy_tables.method_in_gap, "gap and method"),
+    "outside": policy_tables.outside,
     "tasks": policy_tables.tasks,
     "entry": lambda: curves(read("entry/sb3_sac.csv"), lambda r: r["name"], "environment"),
     "audit": policy_tables.audit,

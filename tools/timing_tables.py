@@ -26,6 +26,9 @@ def timing() -> str:
     compiled = {"size": "size", "precision": "precision", "as it is [ms]": "plain_ms", "compiled [ms]": "compiled_ms"}
     compiled |= {"to the former": "to_plain", "compiling [s]": "compile_s", "pays after": "pays_after"}
     parts += ["Updates with compiled networks:", pick(read("timing/time_compile.csv"), compiled)]
+    pairs = {"what": "what", "size": "size", "precision": "precision", "before": "before", "before [ms]": "before_ms"}
+    pairs |= {"now [ms]": "after_ms", "to the former": "ratio"}
+    parts += ["As configured, before and after:", pick(read("timing/time_commits.csv"), pairs)]
     profile = {name: name for name in ("size", "precision", "operation", "ms", "calls")}
     large = [row for row in read("timing/profile_update.csv") if float(row["share"]) >= 0.03]
     shares = pick(large, {**profile, "share": ("share", percent)})
