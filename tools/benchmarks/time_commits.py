@@ -28,6 +28,8 @@ COLUMNS = "what size precision before after before_ms after_ms ratio rounds cpu 
 ROUNDS = 15
 CHILD = """  # runs in either checkout, and so asks for what both have
 import json, sys, time
+own = [f for f in sys.meta_path if not getattr(f, "__module__", "").startswith("__editable__")]
+sys.meta_path[:] = own  # an editable install would fill in what a checkout lacks
 import torch
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
@@ -99,9 +101,20 @@ def worker(tree: Path, size: str, precision: str) -> Iterator[subprocess.Popen[s
 
 
 def milliseconds(process: subprocess.Popen[str], what: str) -> float:
+    """Best time of a few calls in a worker.
+
+    Raises:
+        SystemExit: If it ended.
+    """
     assert process.stdin and process.stdout
-    print(what, file=process.stdin, flush=True)
-    return float(json.loads(process.stdout.readline()))
+    try:
+        print(what, file=process.stdin, flush=True)
+    except BrokenPipeError:  # it ended: nothing can be read below
+        pass
+    line = process.stdout.readline()
+    if not line:
+        sys.exit("The code of one commit ended before it was timed, for the reason above. Give a later one.")
+    return float(json.loads(line))
 
 
 def measure(trees: list[Path], size: str, precision: str, names: list[str], rounds: int) -> list[dict[str, object]]:
