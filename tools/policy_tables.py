@@ -167,6 +167,8 @@ def loop() -> str:
     ):
         identified = pick(read(f"close_the_loop/{file}.csv"), {"verdict": "verdict"} | alone)
         parts.append(f"{says}, from ten rollouts of the policy that fails:\n\n{identified}")
+    ranges = pick(read("close_the_loop/dropo.csv"), alone)
+    parts.append(f"Ranges of the randomisation in place of names (DROPO):\n\n{ranges}")
     for file, says in (
         ("diagnose_run", "What was named"),
         ("diagnose_run_again", "Of others, with the present solver"),
