@@ -26,7 +26,10 @@ def pretrain() -> str:
     rounded = {"model": "model", "updates in": "precision"} | {k: v for k, v in head.items() if k in ROUNDED}
     parts += ["A wide model:", pick(read("pretrain/precision.csv"), rounded | {"return": "return"})]
     own = {k: v for k, v in head.items() if k != "minutes"} | {"learner's memory [MB]": "learner_mb"}
-    return "\n\n".join([*parts, "Collected on a Ray cluster:", pick(read("pretrain/ray.csv"), own)])
+    parts += ["Collected on a Ray cluster:", pick(read("pretrain/ray.csv"), own)]
+    spent = {f"{part} [s]": f"{part}_seconds" for part in ("update", "evaluate", "wait", "save")}
+    spent |= {"learner [MB]": "learner_mb", "collector [MB]": "collector_mb"}
+    return "\n\n".join([*parts, "Where its seconds go, and its memory:", pick(read("pretrain/parts.csv"), spent)])
 
 
 def transfer() -> str:
