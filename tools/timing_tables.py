@@ -4,8 +4,6 @@ from collections.abc import Callable
 
 from tools.tables import percent, pick, read, table, tenth
 
-TRIED = "Searches that stop early, or follow the spread of plans, and are not used:"
-
 
 def timing() -> str:
     plan = {name: name for name in ("what", "size", "precision", "horizon", "decay", "rows", "threads")}
@@ -80,10 +78,16 @@ def quality() -> str:
     head |= {"success": ("success", tenth), "low": ("success_low", tenth), "high": ("success_high", tenth)}
     head |= {"regret": "regret", "spread": "spread", "ms": "plan_ms"}
     parts = []
-    for file, says in (("plan_quality", ""), ("decay", ""), ("early", TRIED), ("early_wide", "A wide search:")):
+    for file, says in (
+        ("plan_quality", "As configured, and cheaper:"),
+        ("decay", "With fewer candidates after each iteration:"),
+        ("early", "Searches that stop early, or follow the spread of plans, and are not used:"),
+        ("early_wide", "The same of a wide search:"),
+    ):
         rows = [{**r, "variant": r["variant"] or "as configured"} for r in read(f"plan_quality/{file}.csv")]
         parts += [says, pick(rows, head)]
-    parts.append(pick(read("plan_quality/early_time.csv"), {"gap": "gap", "search": "variant", "time": "ratio"}))
+    ratio = pick(read("plan_quality/early_time.csv"), {"gap": "gap", "search": "variant", "to the configured": "ratio"})
+    parts += ["Their time:", ratio]
     return "\n\n".join(parts)
 
 

@@ -269,16 +269,17 @@ class WorldModel(nn.Module):
         self.dynamics.residual = residual.to(next(self.parameters()).device)
 
     @torch.no_grad()
-    def add_command_map(self) -> None:
-        """Let the dynamics learn what the machine makes of a command; starts as exactly the identity.
+    def add_command_map(self) -> CommandMap:
+        """Let the dynamics learn what the machine makes of a command, and give the map; starts as exactly the identity.
 
         Raises:
             ValueError: If there is one already.
         """
         if self.dynamics.command is not None:
             raise ValueError("The dynamics already have a command map; add_command_map works once.")
-        command = CommandMap(self.action_dim + self.memory_dim, self.action_dim)
-        self.dynamics.command = command.to(next(self.parameters()).device)
+        command = CommandMap(self.action_dim + self.memory_dim, self.action_dim).to(next(self.parameters()).device)
+        self.dynamics.command = command
+        return command
 
     @torch.no_grad()
     def add_observation_map(self, points: list[list[int]]) -> None:

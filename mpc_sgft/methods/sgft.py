@@ -107,10 +107,9 @@ class SGFT(AbstractMethod):
                 model.add_residual()
             parts = ("dynamics.residual", "policy_head")
         if self.command_map:
-            if model.dynamics.command is None:
-                model.add_command_map()
-            if self.command_band and model.dynamics.command is not None:
-                model.dynamics.command.add_band()
+            commands = model.dynamics.command or model.add_command_map()
+            if self.command_band:
+                commands.add_band()
             parts += ("dynamics.command",)
         if self.observation_map:
             if model.observation_map is None:

@@ -120,9 +120,9 @@ def load(
         if meta.get("residual"):
             model.add_residual()
         if meta.get("command_map"):
-            model.add_command_map()
-        if model.dynamics.command is not None and meta.get("command_band"):
-            model.dynamics.command.add_band()
+            commands = model.add_command_map()
+            if meta.get("command_band"):
+                commands.add_band()
         if meta.get("observation_map") is not None:
             model.add_observation_map(meta["observation_map"])
         model.load_state_dict(tensors)

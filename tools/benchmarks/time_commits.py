@@ -21,7 +21,7 @@ from pathlib import Path
 
 import torch
 
-from tools.benchmarks.time_planner import ROOT, SPACES, UPSTREAM, cpu_name, sizes
+from tools.benchmarks.time_planner import ROOT, SPACES, UPSTREAM, cpu_name, known_sizes
 from tools.studies.runner import write
 
 COLUMNS = "what size precision before after before_ms after_ms ratio rounds cpu torch".split()
@@ -140,7 +140,7 @@ def measure(trees: list[Path], size: str, precision: str, names: list[str], roun
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("commit", help="as git names it")
-    parser.add_argument("--sizes", nargs="+", default=["small", "1M"], choices=sizes())
+    parser.add_argument("--sizes", nargs="+", default=["small", "1M"], choices=known_sizes())
     parser.add_argument("--precisions", nargs="+", default=["auto", "float32"])
     parser.add_argument("--rounds", type=int, default=ROUNDS, help="of five calls each")
     parser.add_argument("--out", type=Path, default=ROOT / "results/timing/time_commits.csv")

@@ -47,7 +47,7 @@ UPSTREAM_MS = {  # eager fp32 on a quiet AMD EPYC with AVX-512-BF16, (what, size
 }  # fmt: skip
 
 
-def sizes() -> list[str]:
+def known_sizes() -> list[str]:
     """Model sizes that stand for themselves."""
     return sorted(p.stem for p in (ROOT / "configs/model").glob("*.yaml") if "_target_" in OmegaConf.load(p))
 
@@ -157,7 +157,7 @@ def measure(
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="3 repeats instead of 20, one environment")
-    parser.add_argument("--sizes", nargs="+", default=["small", "1M", "5M"], choices=sizes())
+    parser.add_argument("--sizes", nargs="+", default=["small", "1M", "5M"], choices=known_sizes())
     parser.add_argument("--threads", nargs="+", type=int, default=[1, 2], choices=(1, 2))
     parser.add_argument("--precisions", nargs="+", default=["float32", "bfloat16"], choices=PRECISIONS)
     parser.add_argument("--default-malloc", action="store_true", help="without planners.malloc.keep_freed_memory()")

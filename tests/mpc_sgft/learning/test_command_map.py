@@ -6,22 +6,21 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from mpc_sgft.learning.dynamics import CommandMap
+from mpc_sgft.learning.dynamics import CommandMap, Dynamics
 from mpc_sgft.learning.fit import Maps, Penalty, fit_dynamics
-from mpc_sgft.learning.slices import Slices
-from mpc_sgft.learning.world_model import WorldModel
+from mpc_sgft.learning.slices import Slices, to_slices
 from tests.mpc_sgft.learning.agents import hand_over, make_agent
 
 A, T, B = 2, 4, 64
 TRUTH = torch.tensor([[0.5, -0.3], [0.3, 0.5]])  # half of the command, turned
 
 
-def transitions(machine: WorldModel, generator: torch.Generator) -> TensorDict:
+def transitions(machine: Dynamics, generator: torch.Generator) -> TensorDict:
     """A batch [B, T] of what a machine does with random commands; latents stand for observations."""
     action = 2 * torch.rand(T, B, A, generator=generator) - 1
     z = [torch.cat([torch.rand(B, 16, generator=generator), 2 * torch.rand(B, 2 * A, generator=generator) - 1], 1)]
     for a in action:
-        z.append(machine.dynamics(z[-1], a))
+        z.append(machine(z[-1], a))
     seen, nothing = torch.stack(z).transpose(0, 1), torch.zeros(B, T, 1)
     following = {"observation": seen[:, 1:], "reward": nothing, "terminated": nothing.bool()}
     batch = {"observation": seen[:, :-1], "action": action.transpose(0, 1), "next": TensorDict(following, [B, T])}
@@ -40,11 +39,7 @@ def taught(agent, simulated: bool, updates: int = 300):
     agent.model.encode = lambda z: z  # latents in place of observations
     generator = torch.Generator().manual_seed(0)
     for _ in range(updates):
-        action = 2 * torch.rand(T, B, A, generator=generator) - 1
-        z = [torch.cat([torch.rand(B, 16, generator=generator), 2 * torch.rand(B, 2 * A, generator=generator) - 1], 1)]
-        for a in action:
-            z.append(machine(z[-1], a))
-        data = Slices(torch.stack(z), action, torch.zeros(T, B), torch.zeros(T, B, dtype=torch.bool))
+        data = to_slices(transitions(machine, generator), agent.device)
         fit_dynamics(agent, data, rho=1.0, maps=Maps((own.command,), own) if simulated else None)
     return dynamics, own
 
@@ -103,7 +98,7 @@ def test_a_threshold_is_told_from_a_weak_arm(band: bool) -> None:
     agent.model.encode = lambda z: z  # latents in place of observations
     generator = torch.Generator().manual_seed(0)
     for _ in range(400):
-        update(transitions(machine, generator))
+        update(transitions(machine.dynamics, generator))
     command = agent.model.dynamics.command
     gains = command.weight[:, :A].diagonal()
     if band:
@@ -164,7 +159,7 @@ def test_tdmpc2_may_be_given_a_command_map(mapped: bool) -> None:
     agent.model.encode = lambda z: z  # latents in place of observations
     generator, errors = torch.Generator().manual_seed(0), []
     for _ in range(300):
-        errors.append(update(transitions(machine, generator))["consistency_loss"])
+        errors.append(update(transitions(machine.dynamics, generator))["consistency_loss"])
     assert (errors[-1] < 0.1 * errors[0]) == mapped
     if mapped:
         assert (agent.model.dynamics.command.weight[:, :A] - TRUTH).abs().max() < 0.05
