@@ -16,7 +16,7 @@ class Gate(NamedTuple):
 
     Attributes:
         margin: They must lower the error to this share of the pretrained error, in the geometric mean over the last
-            `memory` rollouts: one odd rollout shuts nothing.
+            `memory` rollouts: one odd rollout shuts nothing. Once they act, any lower error than that will do.
         memory: Rollouts that the gate looks back on.
         excess: The dynamics beneath the maps act fine-tuned only where, as they were pretrained, they predict these
             rollouts this many times worse than simulated ones: no network is exact, and what it also gets wrong in

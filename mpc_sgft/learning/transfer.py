@@ -3,11 +3,13 @@
 The dynamics and the policy that act are not simply the ones that train. A model fine-tuned on two hundred transitions
 of five rollouts has forgotten what it knew elsewhere, and where zero-shot already worked that does harm. So each new
 rollout is first a test: it has not been trained on, and the pretrained and the fine-tuned dynamics both predict it. The
-fine-tuned parts act once they have predicted such rollouts clearly better; until then the pretrained do. Better at what
-a policy does every time is not better where it does not go, though, and a planner looks there: so the dynamics beneath
-the maps may stay the simulator's where these predict reality as well as they do simulation. What is tested and acts is
-the average of the weights over the last updates, since the last ones alone are one draw of many; of the policy prior, a
-share of the way from the pretrained one (Wortsman et al., "Robust fine-tuning of zero-shot models", CVPR 2022).
+fine-tuned parts act once they have predicted such rollouts clearly better, until then the pretrained do, and they go on
+while they are better at all: rollouts that succeed are easy to predict, so the difference is small there. Better at
+what a policy does every time is not better where it does not go, though, and a planner looks there: so the dynamics
+beneath the maps may stay the simulator's where these predict reality as well as they do simulation. What is tested and
+acts is the average of the weights over the last updates, since the last ones alone are one draw of many; of the policy
+prior, a share of the way from the pretrained one (Wortsman et al., "Robust fine-tuning of zero-shot models", CVPR
+2022).
 """
 
 import copy
@@ -108,7 +110,9 @@ class Transfer:
         if gate and recent:
             errors = [v.mapped for v in recent if v.mapped is not None]
             beneath = not errors or statistics.geometric_mean(errors) > limit
-            accepted = clearly_better(recent, gate.margin)
+            accepted = clearly_better(
+                recent, 1.0 if self.verdicts[-2].accepted else gate.margin
+            )  # acting: better at all
             self.verdicts[-1] = self.verdicts[-1]._replace(accepted=accepted, beneath=beneath)
         return self.verdicts[-1]
 

@@ -8,7 +8,6 @@ from omegaconf import OmegaConf
 from tensordict import TensorDict
 
 from mpc_sgft.learning.agent import Agent
-from mpc_sgft.learning.method import Gate
 from mpc_sgft.learning.transfer import Transfer, Verdict, clearly_better, open_loop_error
 from mpc_sgft.learning.world_model import WorldModel
 from mpc_sgft.methods.sgft import SGFT
@@ -81,14 +80,19 @@ def test_nothing_acts_before_it_predicted_an_unseen_rollout_better():
     assert t.verdicts[-1].accepted and same(t.acting, t.agent.model)
 
 
-def test_the_gate_closes_again_when_predictions_get_worse():
-    t = transfer(updates=60)
-    for _ in range(2):
+@pytest.mark.parametrize(("share", "acts", "goes_on"), [(0.85, False, True), (0.75, True, True), (1.1, False, False)])
+def test_who_acts_goes_on_while_it_is_better_at_all(share: float, acts: bool, goes_on: bool, monkeypatch):
+    """The margin of 0.8 is for who does not act yet; errors of later rollouts are set here."""
+    for before, wanted in ((False, acts), (True, goes_on)):
+        t = transfer(updates=1, margin=0.8)
+        t.verdicts = [Verdict(1.0, 1.0, False), Verdict(1.0, share, before)]
+        monkeypatch.setattr(
+            "mpc_sgft.learning.transfer.open_loop_error",
+            lambda model, *_, t=t: torch.full((2, 2), 1.0 if model is t.pretrained else share),
+        )
         t.learn(rollout(t.pretrained))
-    assert t.verdicts[-1].accepted
-    t.method.gate = Gate(margin=0.0, memory=5)  # nothing is good enough any more
-    t.learn(rollout(t.pretrained))
-    assert same(t.acting, t.pretrained)
+        assert t.verdicts[-1].accepted is wanted
+        assert same(t.acting, t.averaged.model if wanted else t.pretrained)
 
 
 @pytest.mark.parametrize(("odd", "accepted"), [(3.0, True), (10.0, False)])
