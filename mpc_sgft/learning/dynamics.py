@@ -11,23 +11,19 @@ class CommandMap(nn.Linear):
 
         c' = c - d sign(c) where |c| > d, else 0
 
-    Starts as the identity; until `add_band` d is zero. Where it is learned and falls below zero, c' is larger than c.
+    Starts as the identity. Where d is learned and falls below zero, c' is larger than c.
 
     Args:
         inputs: K, the entries of this command and those before it, newest first.
         outputs: Entries of a command [A].
+        band: Whether there is a dead band; without one c' is c.
     """
 
-    def __init__(self, inputs: int, outputs: int) -> None:
+    def __init__(self, inputs: int, outputs: int, *, band: bool = False) -> None:
         super().__init__(inputs, outputs)
         nn.init.eye_(self.weight)
         nn.init.zeros_(self.bias)
-        self.band: nn.Parameter | None = None
-
-    def add_band(self) -> None:
-        """Learn the dead band of each entry too, from zero on; nothing where it is learned already."""
-        if self.band is None:
-            self.band = nn.Parameter(torch.zeros_like(self.bias))
+        self.band = nn.Parameter(torch.zeros(outputs)) if band else None
 
     def forward(self, input: Tensor) -> Tensor:
         c = super().forward(input)
@@ -48,10 +44,13 @@ class Dynamics(nn.Module):
         m'  = [a, m without its last command]                            exact, so only s' is learned
 
     Until `add_command_map` c is u. From then on a `CommandMap` is learned, from the identity on: a gain, a rotation, a
-    drift, a delay, a lag, a dead band, a few numbers that hold wherever the robot is. Commands older than the memory
-    count as its oldest.
+    drift, a delay, a lag, a few numbers that hold wherever the robot is. Commands older than the memory count as its
+    oldest. `add_command_band` adds a second map, with a dead band, which learns beside it and acts in its place while
+    `band_acts`: where all commands are large, a dead band and a weak arm look alike.
     `add_residual` adds a correction that starts at zero.
     """
+
+    band_acts: Tensor  # bool scalar, on the device: there is no graph to record anew when it changes
 
     def __init__(self, code_dim: int, memory_dim: int, action_dim: int, mlp_dim: int, simnorm_dim: int) -> None:
         super().__init__()
@@ -59,6 +58,7 @@ class Dynamics(nn.Module):
         self.base = mlp([inputs, mlp_dim, mlp_dim, code_dim], out=nn.Identity())  # ends in LayerNorm
         self.residual: nn.Module | None = None
         self.command: CommandMap | None = None
+        self.banded: CommandMap | None = None
         self.code_dim, self.memory_dim, self.simnorm_dim = code_dim, memory_dim, simnorm_dim
 
     def forward(self, z: Tensor, action: Tensor) -> Tensor:
@@ -76,7 +76,11 @@ class Dynamics(nn.Module):
         lag = torch.arange(each.shape[-2], device=commands.device)
         longest = self.command.in_features // self.command.out_features
         window = (lag[:, None] + torch.arange(longest, device=commands.device)).clamp(max=len(lag) - 1)
-        return self.command(each[..., window, :].flatten(-2)).flatten(-2)
+        told = each[..., window, :].flatten(-2)
+        made = self.command(told)
+        if self.banded is not None:
+            made = torch.where(self.band_acts, self.banded(told), made)
+        return made.flatten(-2)
 
     def as_simulated(self, z: Tensor) -> Tensor:
         """The latent with its commands as the machine realised them: what the simulator would have called them."""

@@ -29,13 +29,15 @@ class Maps(NamedTuple):
 
     Attributes:
         parts: What learns.
-        simulated: The simulator's dynamics, with the command map of those that train.
+        simulated: The simulator's dynamics, with the command map that acts.
         penalties: On the maps.
+        rival: The simulator's dynamics, with a command map that learns beside it; nothing else learns by these.
     """
 
     parts: tuple[nn.Module, ...]
     simulated: Dynamics
     penalties: tuple[Penalty, ...] = ()
+    rival: Dynamics | None = None
 
 
 @in_own_precision
@@ -80,6 +82,9 @@ def fit_dynamics(
     if maps is not None:
         metrics["map_loss"] = error(maps.simulated, seen)
         of_maps = with_penalties(metrics["map_loss"], maps.penalties)
+        if maps.rival is not None:
+            metrics["rival_loss"] = error(maps.rival, encoded)
+            of_maps = of_maps + metrics["rival_loss"]
     check_finite(metrics)
     agent.optimizers.model.zero_grad()
     scale = agent.weights["consistency_loss"]

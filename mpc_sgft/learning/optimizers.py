@@ -21,7 +21,7 @@ class Optimizers:
         lr: Of the model; the encoder takes its share of it.
         encoder_lr_share: That share.
         policy_lr, entropy_lr: Of the policy prior and of the entropy's weight.
-        command_lr, observation_lr: Of the dynamics' command map and of the observation map; None: lr.
+        command_lr, observation_lr: Of the dynamics' command maps and of the observation map; None: lr.
         recorded: Steps are recorded in CUDA graphs: what they read lies on the device then.
 
     Attributes:
@@ -42,9 +42,10 @@ class Optimizers:
         observation_lr: float | None = None,
         recorded: bool = False,
     ) -> None:
-        maps = ((model.dynamics.command, command_lr), (model.observation_map, observation_lr))
+        of_commands = [part for part in (model.dynamics.command, model.dynamics.banded) if part is not None]
+        maps = (*((part, command_lr) for part in of_commands), (model.observation_map, observation_lr))
         groups = [{"params": [*part.parameters()], "lr": lr if own is None else own} for part, own in maps if part]
-        command = groups[0]["params"] if model.dynamics.command is not None else []
+        command = [p for part in of_commands for p in part.parameters()]
         for part in PRETRAINED:
             parameters = [p for p in getattr(model, part).parameters() if p.requires_grad and part != "policy_head"]
             parameters = [p for p in parameters if all(p is not c for c in command)]

@@ -25,10 +25,11 @@ from tensordict import TensorDict, TensorDictBase
 from mpc_sgft.learning.agent import Agent
 from mpc_sgft.learning.averaged import AveragedWeights
 from mpc_sgft.learning.buffer import make_buffer
-from mpc_sgft.learning.method import AbstractMethod
+from mpc_sgft.learning.method import AbstractMethod, Gate
 from mpc_sgft.learning.observation_map import Sensed
 from mpc_sgft.learning.world_model import WorldModel
 
+WITHOUT_GATE = Gate(margin=1.0, memory=5)  # which command map acts is then a choice between equals
 SIMULATED = 32  # episodes that tell how well the pretrained dynamics predict what they were made for
 SHARED = "observation", "action", "episode", "step", *(("next", k) for k in ("observation", "reward", "terminated"))
 
@@ -41,6 +42,8 @@ class Verdict(NamedTuple):
     accepted: bool  # the fine-tuned parts act in the next rollout
     mapped: float | None = None  # of the pretrained dynamics with the learned maps, where the gate asks
     beneath: bool = True  # the dynamics beneath the maps are among the parts that act then
+    banded: float | None = None  # as `mapped`, with the command map that has a dead band
+    band_acts: bool = False  # this map acts then
 
 
 class Transfer:
@@ -99,22 +102,46 @@ class Transfer:
         def error(model: WorldModel) -> float:
             return float(open_loop_error(model, steps, self.slice_len).nanmean())
 
-        gate, mapped, limit = self.method.gate, None, 0.0
-        if gate and gate.excess:
-            limit = gate.excess * self._error_in_simulation()
-            simulator = copy.deepcopy(self.averaged.model)
-            self._simulate_beneath(simulator)
-            mapped = error(simulator)
-        self.verdicts.append(Verdict(error(self.pretrained), error(self.averaged.model), gate is None, mapped))
-        recent = self.verdicts[1:][-gate.memory :] if gate else []  # at the first rollout all are still the same
-        if gate and recent:
-            errors = [v.mapped for v in recent if v.mapped is not None]
-            beneath = not errors or statistics.geometric_mean(errors) > limit
-            accepted = clearly_better(
-                recent, 1.0 if self.verdicts[-2].accepted else gate.margin
-            )  # acting: better at all
-            self.verdicts[-1] = self.verdicts[-1]._replace(accepted=accepted, beneath=beneath)
-        return self.verdicts[-1]
+        gate, last = self.method.gate, self.verdicts[-1] if self.verdicts else None
+        limit = gate.excess * self._error_in_simulation() if gate and gate.excess else 0.0
+        mapped, banded = self._errors_of_maps(error) if limit or self._has_band else (None, None)
+        verdict = Verdict(error(self.pretrained), math.nan, gate is None, mapped, banded=banded)
+        seen = [*self.verdicts[1:], verdict]  # at the first rollout all are still the same
+        of_maps = [(v.banded, v.mapped) for v in seen if v.banded is not None and v.mapped is not None]
+        if last and of_maps:
+            verdict = verdict._replace(band_acts=self._better(of_maps, last.band_acts))
+            for model in (self.agent.model, self.averaged.model):
+                model.dynamics.band_acts.fill_(verdict.band_acts)
+        verdict = seen[-1] = verdict._replace(fine_tuned=error(self.averaged.model))
+        if gate and last:
+            accepted = self._better([(v.fine_tuned, v.pretrained) for v in seen], last.accepted)
+            verdict = verdict._replace(accepted=accepted)
+            errors = [v.banded if verdict.band_acts else v.mapped for v in seen[-gate.memory :]]
+            beneath = not limit or statistics.geometric_mean(e for e in errors if e is not None) > limit
+            verdict = verdict._replace(beneath=beneath)
+        self.verdicts.append(verdict)
+        return verdict
+
+    @property
+    def _has_band(self) -> bool:
+        return self.agent.model.dynamics.banded is not None
+
+    def _errors_of_maps(self, error: Callable[[WorldModel], float]) -> tuple[float, float | None]:
+        """Of the pretrained dynamics with the learned command map, and with the one that has a dead band."""
+        simulator = copy.deepcopy(self.averaged.model)
+        self._simulate_beneath(simulator)
+        if not self._has_band:
+            return error(simulator), None
+        errors = []
+        for band_acts in (False, True):
+            simulator.dynamics.band_acts.fill_(band_acts)
+            errors.append(error(simulator))
+        return errors[0], errors[1]
+
+    def _better(self, errors: list[tuple[float, float]], acts: bool) -> bool:
+        """Whether the first of these pairs of errors, one a rollout, are clearly lower; of what acts: lower at all."""
+        gate = self.method.gate or WITHOUT_GATE
+        return clearly_better(errors[-gate.memory :], 1.0 if acts else gate.margin)
 
     def _error_in_simulation(self) -> float:
         """Of the pretrained dynamics; asked for at the first rollout, when nothing has trained yet."""
@@ -139,7 +166,12 @@ class Transfer:
             self.averaged.follow(self.agent.model)
         self._hand_over(verdict)
         metrics |= {"error_pretrained": verdict.pretrained, "error_fine_tuned": verdict.fine_tuned}
-        return metrics if verdict.mapped is None else metrics | {"error_mapped": verdict.mapped}
+        metrics |= {} if verdict.mapped is None else {"error_mapped": verdict.mapped}
+        return (
+            metrics
+            if verdict.banded is None
+            else metrics | {"error_banded": verdict.banded, "band_acts": float(verdict.band_acts)}
+        )
 
     def batch(self) -> TensorDictBase:
         """What an update learns from, [B, T]: real slices, and as many simulated ones if the method wants them."""
@@ -190,9 +222,10 @@ class Transfer:
         self.simulated_error = state["simulated_error"]
 
 
-def clearly_better(verdicts: list[Verdict], margin: float) -> bool:
-    """Whether fine-tuning lowered the geometric mean of the errors to less than `margin` of the pretrained one."""
-    return math.prod(v.fine_tuned for v in verdicts) < math.prod(margin * v.pretrained for v in verdicts)
+def clearly_better(errors: Iterable[tuple[float, float]], margin: float) -> bool:
+    """Whether the geometric mean of the first of each pair of errors is less than `margin` of that of the second."""
+    ours, others = zip(*errors, strict=True)
+    return math.prod(ours) < math.prod(margin * x for x in others)
 
 
 def mean_error(model: WorldModel, episodes: TensorDict, horizon: int) -> float:

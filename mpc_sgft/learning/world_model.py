@@ -277,9 +277,25 @@ class WorldModel(nn.Module):
         """
         if self.dynamics.command is not None:
             raise ValueError("The dynamics already have a command map; add_command_map works once.")
-        command = CommandMap(self.action_dim + self.memory_dim, self.action_dim).to(next(self.parameters()).device)
-        self.dynamics.command = command
-        return command
+        self.dynamics.command = self._new_command_map(band=False)
+        return self.dynamics.command
+
+    def add_command_band(self) -> CommandMap:
+        """Let a second command map learn beside the first, with a dead band; it does not act yet. Gives the map.
+
+        Raises:
+            ValueError: If there is one already, or no first.
+        """
+        dynamics = self.dynamics
+        if dynamics.command is None or dynamics.banded is not None:
+            raise ValueError("A second command map needs a first: add_command_map, then add_command_band, each once.")
+        dynamics.banded = self._new_command_map(band=True)
+        dynamics.register_buffer("band_acts", torch.tensor(False, device=dynamics.banded.bias.device))
+        return dynamics.banded
+
+    def _new_command_map(self, *, band: bool) -> CommandMap:
+        sizes = self.action_dim + self.memory_dim, self.action_dim
+        return CommandMap(*sizes, band=band).to(next(self.parameters()).device)
 
     @torch.no_grad()
     def add_observation_map(self, points: list[list[int]]) -> None:

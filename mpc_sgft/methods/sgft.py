@@ -39,7 +39,9 @@ class SGFT(AbstractMethod):
             from the identity.
         residual: Train a correction that starts at zero on top of frozen pretrained dynamics.
         command_map: Also learn what the machine makes of a command, a few numbers that hold everywhere.
-        command_band: With a command map, also how small a command of each entry does nothing.
+        command_band: With a command map, learn a second one beside it that also has a dead band: how small a command of
+            each entry does nothing. It acts in place of the first once it predicted unseen rollouts clearly better, as
+            the gate asks; without a gate, while it predicts them better.
         command_sparsity: Weight of the sum of their absolute differences from the identity, divided by the rollouts so
             far: what is wrong with a machine is mostly one thing (the lasso: Tibshirani, JRSS B 1996).
         observation_map: Also learn what the sensors should have said: a turn of what a camera sees, a shift of each
@@ -50,8 +52,7 @@ class SGFT(AbstractMethod):
         updates, slice_len, action_noise, average_decay, policy_share: As in `AbstractMethod`.
 
     Raises:
-        ValueError: If the horizon is not positive, rho lies outside (0, 1], gate_excess is negative, or command_band
-            is asked for without a command map.
+        ValueError: If the horizon is not positive, rho lies outside (0, 1], or gate_excess is negative.
 
     Source: Yin, Westenbroek et al., ICLR 2025.
     """
@@ -87,11 +88,9 @@ class SGFT(AbstractMethod):
         check_objective(horizon, rho)
         if gate_excess < 0:
             raise ValueError(f"gate_excess={gate_excess} must be 0 or more.")
-        if command_band and not command_map:
-            raise ValueError("command_band=true is part of the command map: set command_map=true, or leave it out.")
         self.horizon, self.lr, self.policy_lr, self.command_lr = horizon, lr, policy_lr, command_lr
         self.entropy_coef, self.rho, self.anchor = entropy_coef, rho, anchor
-        self.residual, self.command_map, self.command_band = residual, command_map, command_band
+        self.residual, self.command_map, self.command_band = residual, command_map, command_map and command_band
         self.command_sparsity = command_sparsity
         self.gate = Gate(gate_margin, gate_memory, gate_excess) if gate else None
         self.updates, self.slice_len, self.action_noise = updates, slice_len, action_noise
@@ -99,6 +98,7 @@ class SGFT(AbstractMethod):
         self.lr_decay, self.average_decay, self.policy_share = lr_decay, average_decay, policy_share
         self._pretrained: list[Tensor] = []  # of the dynamics, where the anchor holds them
         self._simulated: Dynamics | None = None  # as they were pretrained, with the command map of those that train
+        self._banded: Dynamics | None = None  # the same with the map that has a dead band
 
     def take_over(self, agent: Agent, sensed: Sensed) -> None:
         model, parts = agent.model, ("dynamics", "policy_head")
@@ -107,10 +107,13 @@ class SGFT(AbstractMethod):
                 model.add_residual()
             parts = ("dynamics.residual", "policy_head")
         if self.command_map:
-            commands = model.dynamics.command or model.add_command_map()
-            if self.command_band:
-                commands.add_band()
+            if model.dynamics.command is None:
+                model.add_command_map()
             parts += ("dynamics.command",)
+            if self.command_band:
+                if model.dynamics.banded is None:
+                    model.add_command_band()
+                parts += ("dynamics.banded",)
         if self.observation_map:
             if model.observation_map is None:
                 model.add_observation_map(sensed.points())
@@ -126,7 +129,11 @@ class SGFT(AbstractMethod):
         self._pretrained = [p.detach().clone() for p in agent.dynamics_parameters()]
         if self.command_map or self.observation_map:
             self._simulated = copy.deepcopy(model.dynamics).requires_grad_(False)
-            self._simulated.residual, self._simulated.command = None, model.dynamics.command
+            self._simulated.residual = self._simulated.banded = None
+            self._simulated.command = model.dynamics.command
+            if self.command_band:
+                self._banded = copy.deepcopy(self._simulated)
+                self._banded.command = model.dynamics.banded
 
     def update(self, agent: Agent, batch: TensorDictBase, *, starts: Tensor) -> dict[str, float]:
         def distance() -> Tensor:
@@ -149,15 +156,22 @@ class SGFT(AbstractMethod):
         """How command map and observation map learn, given the first observation of each rollout [R, O]."""
         if self._simulated is None:
             return None
-        commands = self._simulated.command if self.command_map else None
+        acting, rival = self._simulated, self._banded
+        if rival is not None and bool(model.dynamics.band_acts):
+            acting, rival = rival, acting
+        told = (model.dynamics.command, model.dynamics.banded) if self.command_map else ()
+        commands = [part for part in told if part is not None]
         sensors = model.observation_map if self.observation_map else None
-        parts = tuple(part for part in (commands, sensors) if part is not None)
+        parts = (*commands, *([] if sensors is None else [sensors]))
+
+        def change() -> Tensor:
+            return torch.stack([c.change() for c in commands]).sum()
+
         penalties: tuple[Penalty, ...] = ()
-        if commands is not None and self.command_sparsity:
-            share = self.command_sparsity / len(starts)
-            penalties += (Penalty("command_change", share, commands.change),)
+        if commands and self.command_sparsity:
+            penalties += (Penalty("command_change", self.command_sparsity / len(starts), change),)
         if sensors is None:
-            return Maps(parts, self._simulated, penalties)
+            return Maps(parts, acting, penalties, rival)
         simulated = self._sensed.starts.to(starts.device)
         box = simulated.amin(0), simulated.amax(0)
         sensors.doubt(starts, *box, DOUBT)
@@ -166,7 +180,7 @@ class SGFT(AbstractMethod):
             far = sensors.outside(starts, *box)
             return self.start_weight * far + self.anchor / len(starts) * sensors.size()
 
-        return Maps(parts, self._simulated, (*penalties, Penalty("sensor_doubt", 1.0, doubt)))
+        return Maps(parts, acting, (*penalties, Penalty("sensor_doubt", 1.0, doubt)), rival)
 
     def _corrections(self, model: WorldModel) -> dict[str, float]:
         """What the observation map makes of the sensors, by name: a turn [rad], shifts in raw units."""
@@ -177,11 +191,12 @@ class SGFT(AbstractMethod):
         return {"sensor_turn": sensors.turned.item()} | {f"sensor_shift_{name}": shift for name, shift in shifts}
 
     def state_dict(self) -> dict[str, Any]:
-        simulated = self._simulated.base.state_dict() if self._simulated else None
+        simulated = self._simulated.base.state_dict() if self._simulated else None  # also beneath the rival
         return {"pretrained": [x.clone() for x in self._pretrained], "simulated": simulated}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         here = [x.device for x in self._pretrained]
         self._pretrained = [x.to(device) for x, device in zip(state["pretrained"], here, strict=True)]
-        if self._simulated:
-            self._simulated.base.load_state_dict(state["simulated"])
+        for dynamics in (self._simulated, self._banded):
+            if dynamics is not None:
+                dynamics.base.load_state_dict(state["simulated"])

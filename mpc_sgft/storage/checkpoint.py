@@ -54,7 +54,7 @@ def describe(cfg: DictConfig, model: WorldModel, extra: Mapping[str, Any] | None
         "value_range": float(model.value_range),
         "residual": model.dynamics.residual is not None,
         "command_map": model.dynamics.command is not None,
-        "command_band": model.dynamics.command is not None and model.dynamics.command.band is not None,
+        "command_band": model.dynamics.banded is not None,
         "observation_map": None if model.observation_map is None else model.observation_map.points,
         "config": config,
         **(extra or {}),
@@ -120,9 +120,9 @@ def load(
         if meta.get("residual"):
             model.add_residual()
         if meta.get("command_map"):
-            commands = model.add_command_map()
-            if meta.get("command_band"):
-                commands.add_band()
+            model.add_command_map()
+        if meta.get("command_band"):
+            model.add_command_band()
         if meta.get("observation_map") is not None:
             model.add_observation_map(meta["observation_map"])
         model.load_state_dict(tensors)

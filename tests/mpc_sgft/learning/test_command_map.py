@@ -9,7 +9,7 @@ from tensordict import TensorDict
 from mpc_sgft.learning.dynamics import CommandMap, Dynamics
 from mpc_sgft.learning.fit import Maps, Penalty, fit_dynamics
 from mpc_sgft.learning.slices import Slices, to_slices
-from tests.mpc_sgft.learning.agents import hand_over, make_agent
+from tests.mpc_sgft.learning.agents import hand_over, make_agent, make_batch
 
 A, T, B = 2, 4, 64
 TRUTH = torch.tensor([[0.5, -0.3], [0.3, 0.5]])  # half of the command, turned
@@ -70,52 +70,82 @@ def test_the_change_is_the_sum_of_absolute_differences() -> None:
 
 
 def test_a_dead_band_brings_commands_nearer_to_zero() -> None:
-    command = CommandMap(4, 2)
+    command = CommandMap(4, 2, band=True)
     assert command(torch.tensor([0.1, -0.7, 9.0, 9.0])).tolist() == pytest.approx([0.1, -0.7])
-    command.add_band()
     with torch.no_grad():
         command.weight[0, 2] = 0.5
         command.band[:] = torch.tensor([0.4, 0.25])
     sent = torch.tensor([[0.3, -0.7, 0.0, 9.0], [-0.3, 0.2, 0.0, 9.0], [0.3, 0.25, 1.0, 9.0]])
     assert command(sent).flatten().tolist() == pytest.approx([0.0, -0.45, 0.0, 0.0, 0.4, 0.0])
     assert command.change().item() == pytest.approx(0.5 + 0.4 + 0.25)
-    command.add_band()  # is there already
-    assert command.band.tolist() == pytest.approx([0.4, 0.25])
 
 
-@pytest.mark.parametrize("band", [True, False])
-def test_a_threshold_is_told_from_a_weak_arm(band: bool) -> None:
+def test_one_of_two_command_maps_acts() -> None:
+    model = make_agent(sizes={"obs_dim": 6 + 2 * A, "memory_dim": 2 * A}).model
+    with pytest.raises(ValueError, match="add_command_map, then add_command_band"):
+        model.add_command_band()
+    first, second, sent = model.add_command_map(), model.add_command_band(), torch.ones(1, 3 * A)
+    with torch.no_grad():
+        first.bias.fill_(1.0)
+        second.band.fill_(0.25)
+    assert (model.dynamics.realised(sent) == 2.0).all()
+    model.dynamics.band_acts.fill_(True)
+    assert (model.dynamics.realised(sent) == 0.75).all()
+
+
+def test_a_threshold_is_told_from_a_weak_arm() -> None:
     """A machine that gives 0.9 of a command and does nothing with a small one; a gain alone passes for weakness."""
     agent = make_agent(sizes={"obs_dim": 6 + 2 * A, "memory_dim": 2 * A})
     torch.nn.init.orthogonal_(agent.model.dynamics.base[-1].linear.weight)
     machine = copy.deepcopy(agent.model)
     machine.add_command_map()
-    machine.dynamics.command.add_band()
+    machine.add_command_band()
     machine.requires_grad_(False)
-    machine.dynamics.command.weight.mul_(0.9)
-    machine.dynamics.command.band.fill_(0.35)
-    update = hand_over(agent, command_map=True, command_band=band, slice_len=T, lr=1e-6)
+    machine.dynamics.band_acts.fill_(True)
+    machine.dynamics.banded.weight.mul_(0.9)
+    machine.dynamics.banded.band.fill_(0.35)
+    update = hand_over(agent, command_map=True, command_band=True, slice_len=T, lr=1e-6)
     agent.model.encode = lambda z: z  # latents in place of observations
     generator = torch.Generator().manual_seed(0)
     for _ in range(400):
         update(transitions(machine.dynamics, generator))
-    command = agent.model.dynamics.command
-    gains = command.weight[:, :A].diagonal()
-    if band:
-        assert (command.band - 0.35).abs().max() < 0.03 and (gains - 0.9).abs().max() < 0.05
-    else:
-        assert command.band is None and gains.max() < 0.75
+    plain, banded = agent.model.dynamics.command, agent.model.dynamics.banded
+    assert plain.band is None and plain.weight[:, :A].diagonal().max() < 0.75
+    assert (banded.band - 0.35).abs().max() < 0.03
+    assert (banded.weight[:, :A].diagonal() - 0.9).abs().max() < 0.05
+
+
+@pytest.mark.parametrize("band_acts", [True, False])
+def test_the_observation_map_learns_by_the_map_that_acts(band_acts: bool) -> None:
+    """Its slope is that of the loss with this map alone: beside a rival that is far off it is the same."""
+    shifts = []
+    for far in (0.0, 5.0):
+        agent = make_agent(grad_clip=1e9)  # which all share
+        update = hand_over(agent, command_map=True, command_band=True, observation_map=True, slice_len=T)
+        dynamics, sensors = agent.model.dynamics, agent.model.observation_map
+        dynamics.band_acts.fill_(band_acts)
+        (dynamics.command if band_acts else dynamics.banded).bias.data.fill_(far)
+        sensors.doubted.fill_(1.0)
+        sensors.doubt = lambda *_: None  # they stay doubted
+        update(make_batch(steps=T))
+        shifts.append(agent.optimizers.model.state[sensors.shift]["exp_avg"].clone())
+    assert shifts[0].abs().max() > 0
+    torch.testing.assert_close(*shifts)
 
 
 def test_a_later_deployment_may_ask_for_a_band() -> None:
     agent = make_agent(sizes={"obs_dim": 6 + 2 * A, "memory_dim": 2 * A})
     hand_over(agent, command_map=True)
-    assert agent.model.dynamics.command.band is None
+    assert agent.model.dynamics.banded is None
     hand_over(agent, command_map=True, command_band=True)
     trained = [id(p) for p in agent.optimizers.trained]
-    assert id(agent.model.dynamics.command.band) in trained
-    with pytest.raises(ValueError, match="command_band=true is part of the command map"):
-        hand_over(agent, command_map=False, command_band=True)
+    assert id(agent.model.dynamics.banded.band) in trained and len(trained) == len(set(trained))
+
+
+def test_without_a_command_map_there_is_no_band() -> None:
+    agent = make_agent(sizes={"obs_dim": 6 + 2 * A, "memory_dim": 2 * A})
+    hand_over(agent, command_map=False, command_band=True)
+    assert agent.model.dynamics.command is None and agent.model.dynamics.banded is None
 
 
 @pytest.mark.parametrize("weight", [0.0, 1e-4])

@@ -24,7 +24,8 @@ def model_with(*, memory: int, reward_from: str = "next", command: str = "", res
     if command:
         model.add_command_map()
     if command == "band":
-        model.dynamics.command.add_band()
+        model.add_command_band()
+        model.dynamics.band_acts.fill_(True)
     if residual:
         model.add_residual(16)
     with torch.no_grad():

@@ -30,6 +30,7 @@ def make_sgft(**changes) -> SGFT:
         "gate_excess": 0.0,
         "anchor": 0.0,
         "command_map": False,
+        "command_band": False,
         "observation_map": False,
         "lr_decay": 0.0,
         "average_decay": 0.0,
@@ -98,8 +99,8 @@ def test_who_acts_goes_on_while_it_is_better_at_all(share: float, acts: bool, go
 @pytest.mark.parametrize(("odd", "accepted"), [(3.0, True), (10.0, False)])
 def test_one_odd_rollout_does_not_shut_the_gate(odd, accepted):
     """0.5^4 * 3 = 0.19 < 0.9^5 = 0.59 < 0.5^4 * 10, although the sums would say 5 > 0.9 * 5."""
-    verdicts = [Verdict(1.0, error, accepted=True) for error in (0.5, 0.5, 0.5, 0.5, odd)]
-    assert clearly_better(verdicts, margin=0.9) is accepted
+    errors = [(error, 1.0) for error in (0.5, 0.5, 0.5, 0.5, odd)]
+    assert clearly_better(errors, margin=0.9) is accepted
 
 
 def test_without_the_gate_what_trains_acts_at_once():
@@ -137,6 +138,42 @@ def test_the_dynamics_beneath_the_maps_stay_where_simulation_is_predicted_as_bad
     again.load_state_dict(t.state_dict())
     again.learn(simulated[1])
     assert asked == [32] and again.simulated_error == t.simulated_error
+
+
+@pytest.mark.parametrize("gate", [True, False])
+@pytest.mark.parametrize("acts", [True, False])
+@pytest.mark.parametrize("share", [0.75, 0.85, 1.1])
+def test_a_dead_band_acts_once_it_tells_unseen_rollouts_better(gate: bool, acts: bool, share: float, monkeypatch):
+    """By the gate's margin of 0.8, or at all where it acts already; without a gate, at all."""
+    t = transfer(gate=gate, updates=1, margin=0.8, sizes=MEMORY, of_method={"command_map": True, "command_band": True})
+
+    def error(model: WorldModel, *_) -> torch.Tensor:
+        return torch.full((2, 2), share if model.dynamics.band_acts else 1.0)
+
+    monkeypatch.setattr("mpc_sgft.learning.transfer.open_loop_error", error)
+    steps = rollout(t.pretrained)
+    t.verdicts = [Verdict(1.0, 1.0, False), Verdict(1.0, 1.0, True, mapped=1.0, banded=share, band_acts=acts)]
+    for model in (t.agent.model, t.averaged.model):
+        model.dynamics.band_acts.fill_(acts)
+    metrics = t.learn(steps)
+    wanted = share < (0.8 if gate and not acts else 1.0)
+    assert t.verdicts[-1].band_acts is wanted and metrics["band_acts"] == wanted
+    assert (metrics["error_mapped"], metrics["error_banded"]) == pytest.approx((1.0, share))
+    assert all(bool(m.dynamics.band_acts) == wanted for m in (t.agent.model, t.averaged.model))
+    accepted = wanted if gate else True
+    assert bool(t.acting.dynamics.band_acts) == (wanted and accepted)
+    assert not t.pretrained.dynamics.band_acts
+
+
+def test_which_map_acts_is_kept():
+    numbers = {"command_map": True, "command_band": True}
+    t = transfer(sizes=MEMORY, of_method=numbers)
+    t.learn(rollout(t.pretrained))
+    t.agent.model.dynamics.band_acts.fill_(True)
+    t.acting.dynamics.band_acts.fill_(True)
+    again = transfer(sizes=MEMORY, of_method=numbers)
+    again.load_state_dict(t.state_dict())
+    assert again.agent.model.dynamics.band_acts and again.acting.dynamics.band_acts and again.verdicts == t.verdicts
 
 
 def test_a_negative_excess_is_refused_and_without_a_gate_there_is_none():

@@ -119,7 +119,7 @@ def test_residual_starts_exactly_equal_and_only_it_trains():
 
 def test_what_is_added_lies_where_the_model_does():
     model = tiny(memory_dim=4).to("meta")  # a device like any other here
-    model.add_residual(), model.add_command_map(), model.add_observation_map([[0, 1]])
+    model.add_residual(), model.add_command_map(), model.add_command_band(), model.add_observation_map([[0, 1]])
     assert {x.device.type for x in (*model.parameters(), *model.buffers())} == {"meta"}
 
 

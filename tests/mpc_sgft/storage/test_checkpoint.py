@@ -26,8 +26,8 @@ def saved(path, residual=False, band=False):
         torch.nn.init.normal_(model.dynamics.residual[-1].weight)
     if band:
         model.add_command_map()
-        model.dynamics.command.add_band()
-        torch.nn.init.uniform_(model.dynamics.command.band)
+        torch.nn.init.uniform_(model.add_command_band().band)
+        model.dynamics.band_acts.fill_(True)
     checkpoint.save(path, model, checkpoint.describe(CFG, model, extra={"transitions": 7}))
     return model
 
