@@ -50,7 +50,7 @@ class Dynamics(nn.Module):
     `add_residual` adds a correction that starts at zero.
     """
 
-    band_acts: Tensor  # bool scalar, on the device: there is no graph to record anew when it changes
+    band_acts: Tensor  # bool scalar
 
     def __init__(self, code_dim: int, memory_dim: int, action_dim: int, mlp_dim: int, simnorm_dim: int) -> None:
         super().__init__()
@@ -76,11 +76,15 @@ class Dynamics(nn.Module):
         lag = torch.arange(each.shape[-2], device=commands.device)
         longest = self.command.in_features // self.command.out_features
         window = (lag[:, None] + torch.arange(longest, device=commands.device)).clamp(max=len(lag) - 1)
-        told = each[..., window, :].flatten(-2)
-        made = self.command(told)
-        if self.banded is not None:
-            made = torch.where(self.band_acts, self.banded(told), made)
-        return made.flatten(-2)
+        return self._made(self.command, each[..., window, :].flatten(-2)).flatten(-2)
+
+    def _made(self, command: CommandMap, told: Tensor) -> Tensor:
+        """What the map that acts makes of commands [..., K]; on a GPU of both, so that recorded graphs follow it."""
+        if self.banded is None:
+            return command(told)
+        if told.is_cuda:
+            return torch.where(self.band_acts, self.banded(told), command(told))
+        return (self.banded if self.band_acts else command)(told)
 
     def as_simulated(self, z: Tensor) -> Tensor:
         """The latent with its commands as the machine realised them: what the simulator would have called them."""

@@ -9,6 +9,7 @@ from tensordict import TensorDict
 from mpc_sgft.learning.dynamics import CommandMap, Dynamics
 from mpc_sgft.learning.fit import Maps, Penalty, fit_dynamics
 from mpc_sgft.learning.slices import Slices, to_slices
+from mpc_sgft.learning.world_model import WorldModel
 from tests.mpc_sgft.learning.agents import hand_over, make_agent, make_batch
 
 A, T, B = 2, 4, 64
@@ -80,17 +81,41 @@ def test_a_dead_band_brings_commands_nearer_to_zero() -> None:
     assert command.change().item() == pytest.approx(0.5 + 0.4 + 0.25)
 
 
-def test_one_of_two_command_maps_acts() -> None:
+def two_maps() -> WorldModel:
+    """The first adds one to a command, the second takes a quarter off."""
     model = make_agent(sizes={"obs_dim": 6 + 2 * A, "memory_dim": 2 * A}).model
-    with pytest.raises(ValueError, match="add_command_map, then add_command_band"):
-        model.add_command_band()
-    first, second, sent = model.add_command_map(), model.add_command_band(), torch.ones(1, 3 * A)
+    first, second = model.add_command_map(), model.add_command_band()
     with torch.no_grad():
         first.bias.fill_(1.0)
         second.band.fill_(0.25)
-    assert (model.dynamics.realised(sent) == 2.0).all()
-    model.dynamics.band_acts.fill_(True)
-    assert (model.dynamics.realised(sent) == 0.75).all()
+    return model
+
+
+def test_one_of_two_command_maps_acts() -> None:
+    dynamics, sent = two_maps().dynamics, torch.ones(1, 3 * A)
+    assert (dynamics.realised(sent) == 2.0).all()
+    dynamics.band_acts.fill_(True)
+    assert (dynamics.realised(sent) == 0.75).all()
+
+
+@pytest.mark.gpu
+def test_what_was_recorded_follows_the_map_that_acts() -> None:
+    dynamics, sent = two_maps().cuda().dynamics, torch.ones(1, 3 * A, device="cuda")
+    graph = torch.cuda.CUDAGraph()
+    with torch.no_grad():
+        dynamics.realised(sent)
+        with torch.cuda.graph(graph):
+            made = dynamics.realised(sent)
+    for acts, wanted in ((False, 2.0), (True, 0.75), (False, 2.0)):
+        dynamics.band_acts.fill_(acts)
+        graph.replay()
+        assert (made == wanted).all()
+
+
+def test_a_second_command_map_needs_a_first() -> None:
+    model = make_agent().model
+    with pytest.raises(ValueError, match="add_command_map, then add_command_band"):
+        model.add_command_band()
 
 
 def test_a_threshold_is_told_from_a_weak_arm() -> None:
