@@ -9,11 +9,13 @@ import torch
 from omegaconf import DictConfig
 from tensordict import TensorDict
 from torch import Tensor
+from tqdm import tqdm
 
 from mpc_sgft.command.compose import compose
 from mpc_sgft.learning.world_model import WorldModel
 from mpc_sgft.runs import build
-from mpc_sgft.runs.collect import Act, collect, planner_policy, random_policy
+from mpc_sgft.runs.collect import Act, collect, planner_policy, random_policy, shown
+from mpc_sgft.storage.metrics import progress
 from planners.policy import PolicyPlanner
 
 POLICY = ("normalizer", "encoder", "policy_head", "recurrent_policy")  # what acting takes of the model
@@ -69,8 +71,8 @@ class Explorer:
         count = share(cfg.num_envs, part, parts)
         self.env = build.make_env(cfg, count, randomised=True, learning=True, threads=threads)
 
-    def collect(self, order: Round) -> Collected:
-        """Collect this worker's share of a round."""
+    def collect(self, order: Round, bar: tqdm | None = None) -> Collected:
+        """Collect this worker's share of a round; a progress bar counts its steps."""
         before = self.env.backend.counters["unstable"]
         seed = round_seed(self.cfg.seed, order.number * self.parts + self.part)
         randomizer = self.env.backend.randomizer
@@ -80,7 +82,7 @@ class Explorer:
         else:
             self.model.load_state_dict(order.weights, strict=False)
             act = explorer(self.model, self.cfg, self.env.batch_size[0], seed)
-        steps = collect(self.env, act, seed=seed)
+        steps = collect(self.env, shown(act, bar) if bar is not None else act, seed=seed)
         places = torch.from_numpy(randomizer.places.copy())
         roaming = len(places) if order.weights is None else int(self.cfg.detours.share * len(places))
         places[:roaming] = torch.nan
@@ -104,8 +106,9 @@ def explored(cfg: DictConfig, model: WorldModel, episodes: int) -> TensorDict:
     words = [f"task={task}", f"num_envs={episodes}", f"seed={cfg.seed}", f"physics={cfg.physics}", *own]
     worker = Explorer(compose("pretrain", words, []), dict(model.sizes))
     build.check_fits(model, worker.env)
-    with closing(worker.env.backend):
-        return worker.collect(Round(0, policy_weights(model))).steps
+    steps = worker.env.task.episode_steps
+    with closing(worker.env.backend), progress(steps, desc="simulate", disable=cfg.quiet, leave=False) as bar:
+        return worker.collect(Round(0, policy_weights(model)), bar).steps
 
 
 def share(count: int, part: int, parts: int) -> int:

@@ -25,3 +25,10 @@ def test_explored_episodes_are_those_of_pretraining_and_follow_the_seed() -> Non
     with pytest.raises(UserError, match="obs_dim"):
         explored(compose("deploy", ["task.history=1"], ["task.history=1"]), agent.model, 6)
     assert all(torch.equal(v, weights[k]) for k, v in agent.model.state_dict().items())
+
+
+@pytest.mark.parametrize("quiet", [True, False])
+def test_a_bar_shows_how_far_the_simulated_episodes_are(quiet: bool, capsys) -> None:
+    cfg = compose("deploy", [f"quiet={quiet}"], [])
+    explored(cfg, build.load_agent(cfg)[0].model, 2)
+    assert ("simulate" in capsys.readouterr().err) is not quiet
