@@ -29,7 +29,9 @@ from mpc_sgft.learning.method import AbstractMethod, Gate
 from mpc_sgft.learning.observation_map import Sensed
 from mpc_sgft.learning.world_model import WorldModel
 
-WITHOUT_GATE = Gate(margin=1.0, memory=5)  # which command map acts is then a choice between equals
+WITHOUT_GATE = Gate(
+    margin=1.0, memory=5
+)  # which command map acts is told without one too: the one that predicts better
 SIMULATED = 32  # episodes that tell how well the pretrained dynamics predict what they were made for
 SHARED = "observation", "action", "episode", "step", *(("next", k) for k in ("observation", "reward", "terminated"))
 
@@ -127,7 +129,7 @@ class Transfer:
         return self.agent.model.dynamics.banded is not None
 
     def _errors_of_maps(self, error: Callable[[WorldModel], float]) -> tuple[float, float | None]:
-        """Of the pretrained dynamics with the learned command map, and with the one that has a dead band."""
+        """Of the pretrained dynamics with the learned maps, and with the command map that has a dead band."""
         simulator = copy.deepcopy(self.averaged.model)
         self._simulate_beneath(simulator)
         if not self._has_band:
@@ -166,12 +168,11 @@ class Transfer:
             self.averaged.follow(self.agent.model)
         self._hand_over(verdict)
         metrics |= {"error_pretrained": verdict.pretrained, "error_fine_tuned": verdict.fine_tuned}
-        metrics |= {} if verdict.mapped is None else {"error_mapped": verdict.mapped}
-        return (
-            metrics
-            if verdict.banded is None
-            else metrics | {"error_banded": verdict.banded, "band_acts": float(verdict.band_acts)}
-        )
+        if verdict.mapped is not None:
+            metrics["error_mapped"] = verdict.mapped
+        if verdict.banded is not None:
+            metrics |= {"error_banded": verdict.banded, "band_acts": float(verdict.band_acts)}
+        return metrics
 
     def batch(self) -> TensorDictBase:
         """What an update learns from, [B, T]: real slices, and as many simulated ones if the method wants them."""

@@ -159,8 +159,8 @@ class SGFT(AbstractMethod):
         acting, rival = self._simulated, self._banded
         if rival is not None and bool(model.dynamics.band_acts):
             acting, rival = rival, acting
-        told = (model.dynamics.command, model.dynamics.banded) if self.command_map else ()
-        commands = [part for part in told if part is not None]
+        told = (acting, rival) if self.command_map else ()
+        commands = [dynamics.command for dynamics in told if dynamics is not None and dynamics.command is not None]
         sensors = model.observation_map if self.observation_map else None
         parts = (*commands, *([] if sensors is None else [sensors]))
 
