@@ -114,10 +114,12 @@ def method_in_gap(row: Row) -> str:
 
 def outside() -> str:
     def way(row: Row) -> str:
-        return f"`{row['gap']}`, {'with a dead band' if row['variant'] else 'without'}"
+        return f"`{row['gap']}`, {'one map, with a dead band' if row['variant'] else 'one map, without'}"
 
-    later = curves(read("outside/band.csv"), way, "gap, command map")
-    return f"{curves(read('outside/sgft.csv'), method_in_gap, 'gap and method')}\n\nLater:\n\n{later}"
+    today = curves(read("outside/deadband.csv"), method_in_gap, "gap and method")
+    earlier = curves(read("outside/band.csv"), way, "gap, command map")
+    first = curves(read("outside/sgft.csv"), method_in_gap, "gap and method")
+    return f"{first}\n\nWith a second command map:\n\n{today}\n\nWhat led there:\n\n{earlier}"
 
 
 def audit() -> str:
