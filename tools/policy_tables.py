@@ -51,6 +51,8 @@ def tasks() -> str:
     parts = [pick(read("tasks/pretrained.csv"), head), curves(rows, method_in_gap, "gap and method")]
     kept = [{**row, "task": name} for name in ("hammer", "insert") for row in read(f"tasks/{name}_mild.csv")]
     parts.append(f"In `mild`, where there is nothing to gain:\n\n{curves(kept, lambda row: row['task'], 'task')}")
+    today = curves(read("tasks/mild.csv"), lambda row: row["task"], "task")
+    parts.append(f"By today's settings:\n\n{today}")
     walked: dict[str, str | tuple[str, Callable[[str], str]]]
     walked = {"gap": "gap", "method": "method", "seed": "seed", "rollouts": "rollouts"}
     walked |= {"return": ("return", digits), "success": ("success", percent)}

@@ -133,7 +133,7 @@ class SGFT(AbstractMethod):
             self._simulated.command = model.dynamics.command
             if self.command_band:
                 self._banded = copy.deepcopy(self._simulated)
-                self._banded.command = model.dynamics.banded
+                self._banded.base, self._banded.command = self._simulated.base, model.dynamics.banded
 
     def update(self, agent: Agent, batch: TensorDictBase, *, starts: Tensor) -> dict[str, float]:
         def distance() -> Tensor:
@@ -191,12 +191,11 @@ class SGFT(AbstractMethod):
         return {"sensor_turn": sensors.turned.item()} | {f"sensor_shift_{name}": shift for name, shift in shifts}
 
     def state_dict(self) -> dict[str, Any]:
-        simulated = self._simulated.base.state_dict() if self._simulated else None  # also beneath the rival
+        simulated = self._simulated.base.state_dict() if self._simulated else None
         return {"pretrained": [x.clone() for x in self._pretrained], "simulated": simulated}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         here = [x.device for x in self._pretrained]
         self._pretrained = [x.to(device) for x, device in zip(state["pretrained"], here, strict=True)]
-        for dynamics in (self._simulated, self._banded):
-            if dynamics is not None:
-                dynamics.base.load_state_dict(state["simulated"])
+        if self._simulated:
+            self._simulated.base.load_state_dict(state["simulated"])  # beneath both maps

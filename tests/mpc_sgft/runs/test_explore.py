@@ -5,8 +5,9 @@ import torch
 
 from mpc_sgft.command.compose import compose
 from mpc_sgft.command.errors import UserError
-from mpc_sgft.runs import build
+from mpc_sgft.runs import build, explore
 from mpc_sgft.runs.explore import explored
+from mpc_sgft.storage.metrics import progress
 
 
 def test_explored_episodes_are_those_of_pretraining_and_follow_the_seed() -> None:
@@ -28,7 +29,10 @@ def test_explored_episodes_are_those_of_pretraining_and_follow_the_seed() -> Non
 
 
 @pytest.mark.parametrize("quiet", [True, False])
-def test_a_bar_shows_how_far_the_simulated_episodes_are(quiet: bool, capsys) -> None:
+def test_a_bar_shows_how_far_the_simulated_episodes_are(quiet: bool, capsys, monkeypatch) -> None:
+    bars = []
+    monkeypatch.setattr(explore, "progress", lambda *given, **named: bars.append(progress(*given, **named)) or bars[-1])
     cfg = compose("deploy", [f"quiet={quiet}"], [])
     explored(cfg, build.load_agent(cfg)[0].model, 2)
     assert ("simulate" in capsys.readouterr().err) is not quiet
+    assert quiet or bars[0].n == bars[0].total == 40, "every step counts"
