@@ -21,6 +21,18 @@ class Penalty(NamedTuple):
     value: Callable[[], Tensor]  # worked out after the loss
 
 
+class Suspicion(NamedTuple):
+    """What the sensors could be suspected of beside what the observation map corrects, learned without acting.
+
+    Attributes:
+        shift: Of each entry, [R]: what learns.
+        penalties: On it.
+    """
+
+    shift: nn.Parameter
+    penalties: tuple[Penalty, ...] = ()
+
+
 class Maps(NamedTuple):
     """How the maps learn: they explain of the data what they can together with the simulator's dynamics.
 
@@ -32,12 +44,14 @@ class Maps(NamedTuple):
         simulated: The simulator's dynamics, with the command map that acts.
         penalties: On the maps.
         rival: The simulator's dynamics, with a command map that learns beside it; nothing else learns by these.
+        suspicion: What the observation map learns beside what it corrects, by `simulated` as it is.
     """
 
     parts: tuple[nn.Module, ...]
     simulated: Dynamics
     penalties: tuple[Penalty, ...] = ()
     rival: Dynamics | None = None
+    suspicion: Suspicion | None = None
 
 
 @in_own_precision
@@ -85,12 +99,18 @@ def fit_dynamics(
         if maps.rival is not None:
             metrics["rival_loss"] = error(maps.rival, encoded)
             of_maps = of_maps + metrics["rival_loss"]
+        if maps.suspicion is not None:
+            suspected = agent.model.encode(data.observation, suspected=True)
+            metrics["suspicion_loss"] = error(maps.simulated, suspected)
+            of_suspicion = with_penalties(metrics["suspicion_loss"], maps.suspicion.penalties)
     check_finite(metrics)
     agent.optimizers.model.zero_grad()
     scale = agent.weights["consistency_loss"]
     (scale * total).backward(inputs=agent.dynamics_parameters() if maps else None)
     if maps is not None:
         (scale * of_maps).backward(inputs=[p for part in maps.parts for p in part.parameters()])
+        if maps.suspicion is not None:
+            (scale * of_suspicion).backward(inputs=[maps.suspicion.shift])
     metrics["grad_norm"] = torch.nn.utils.clip_grad_norm_(agent.optimizers.trained, agent.grad_clip, foreach=True)
     agent.optimizers.model.step()
     return metrics, encoded

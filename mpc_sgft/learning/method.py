@@ -40,6 +40,8 @@ class AbstractMethod(ABC):
         slice_len: Consecutive steps of a slice of the replay [T].
         action_noise: Standard deviation of the noise on real actions, action units.
         gate: When fine-tuned parts may act; None: at once.
+        suspicion_margin: What the observation map suspects by how things move is corrected once it lowers the error of
+            the pretrained dynamics with the maps to this share, looked at as the gate does; 0: never.
         average_decay: Of the averaged weights that are tested and act, per update; 0: the last ones.
         terminal: What plans end in, as `WorldModel` has it.
         policy_share: Of the way from the pretrained policy prior to the fine-tuned one that acts.
@@ -51,6 +53,7 @@ class AbstractMethod(ABC):
     slice_len: int
     action_noise: float
     gate: Gate | None = None
+    suspicion_margin: float = 0.0
     average_decay: float = 0.0
     policy_share: float = 1.0
     terminal: str = "value"

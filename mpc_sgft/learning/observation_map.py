@@ -7,6 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 SUFFIXES = "_x", "_y"
+DOUBT = 0.03  # squared distance, in spreads of an entry, that matters: of starts from the simulated, of a shift from 0
 
 
 class Sensed(NamedTuple):
@@ -32,7 +33,9 @@ class ObservationMap(nn.Module):
 
     Only doubted entries are corrected, and points are turned only if an entry of one is. Doubt comes from where
     episodes start: nothing has moved yet, so if it looks odd there, no dynamics can be to blame. Without that a map
-    explains whatever the dynamics do otherwise than in simulation, and moves a nail that only sits harder.
+    explains whatever the dynamics do otherwise than in simulation, and moves a nail that only sits harder. A puck that
+    is seen beside its place may still start where others do; what moves it tells then. So the other entries have shifts
+    too (`suspected`), which correct nothing until `suspects` says that they do: only those that are not small.
 
     Args:
         points: Pairs of entries that are the x and y of a point, [P, 2].
@@ -44,6 +47,7 @@ class ObservationMap(nn.Module):
     centre: Tensor
     unit: Tensor
     doubted: Tensor
+    suspects: Tensor
 
     def __init__(self, points: list[list[int]], centre: Tensor, unit: Tensor, blocks: int) -> None:
         super().__init__()
@@ -53,6 +57,7 @@ class ObservationMap(nn.Module):
         self.register_buffer("centre", centre.clone())
         self.register_buffer("unit", unit.clone())
         self.register_buffer("doubted", torch.zeros_like(unit))  # 0 or 1, [R]
+        self.register_buffer("suspects", torch.tensor(False, device=unit.device))  # bool scalar
 
     @property
     def turned(self) -> Tensor:
@@ -62,13 +67,22 @@ class ObservationMap(nn.Module):
     @property
     def shifted(self) -> Tensor:
         """By how much entries are shifted, raw units [R]."""
-        return self.doubted * self.shift * self.unit
+        corrected = self.doubted.bool() | (self.suspects & (self.shift.square() > DOUBT))
+        return torch.where(corrected, self.shift, 0.0) * self.unit
 
     def forward(self, observation: Tensor) -> Tensor:
         """Corrected observations, [..., O] -> [..., O]; past actions stay as they are."""
+        return self._correct(observation, self.shifted)
+
+    def suspected(self, observation: Tensor) -> Tensor:
+        """Observations corrected in all entries, [..., O] -> [..., O]; only those that are not doubted learn by it."""
+        shift = torch.where(self.doubted.bool(), self.shift.detach(), self.shift)
+        return self._correct(observation, shift * self.unit)
+
+    def _correct(self, observation: Tensor, shifted: Tensor) -> Tensor:
         size = len(self.unit)
         seen = observation[..., : self.blocks * size].unflatten(-1, (self.blocks, size))
-        right = seen + self.shifted
+        right = seen + shifted
         if self.points:
             i, j = torch.tensor(self.points, device=seen.device).T
             x, y = (seen - self.centre)[..., i], (seen - self.centre)[..., j]
@@ -79,24 +93,29 @@ class ObservationMap(nn.Module):
         return torch.cat([right.flatten(-2), observation[..., self.blocks * size :]], -1)
 
     def size(self) -> Tensor:
-        """Squared distance from the identity, scalar."""
-        return self.turn.square().sum() + self.shift.square().sum()
+        """Squared distance from the identity, of the turn and of doubted entries, scalar."""
+        return self.turn.square().sum() + (self.doubted * self.shift).square().sum()
+
+    def suspicion(self) -> Tensor:
+        """Sum of the absolute shifts of entries that are not doubted, in units, scalar."""
+        return ((1 - self.doubted) * self.shift).abs().sum()
 
     @torch.no_grad()
-    def doubt(self, starts: Tensor, low: Tensor, high: Tensor, enough: float) -> None:
+    def doubt(self, starts: Tensor, low: Tensor, high: Tensor, enough: float = DOUBT) -> None:
         """Doubt the entries whose starts [N, O], as they were seen, lie outside a box by more than `enough` in sum.
 
         A sum: one start that is clearly outside stays so, however many lie within.
         """
         self.doubted.copy_(self._outside(starts[..., : len(self.unit)], low, high).sum(0) > enough)
 
-    def outside(self, starts: Tensor, low: Tensor, high: Tensor) -> Tensor:
+    def outside(self, starts: Tensor, low: Tensor, high: Tensor, *, suspected: bool = False) -> Tensor:
         """How far corrected starts [N, O] lie outside a box of R entries, in units, mean over starts, scalar.
 
         Distances are squared up to one unit and linear beyond (Huber, 1964): an entry that hardly moved in simulation,
         and so has a tiny unit, must not drown the others.
         """
-        return self._outside(self(starts)[..., : len(self.unit)], low, high).mean(0).sum()
+        corrected = self.suspected(starts) if suspected else self(starts)
+        return self._outside(corrected[..., : len(self.unit)], low, high).mean(0).sum()
 
     def _outside(self, seen: Tensor, low: Tensor, high: Tensor) -> Tensor:
         far = ((seen - high).clamp_min(0) + (low - seen).clamp_min(0)) / self.unit

@@ -13,18 +13,19 @@ prior, a share of the way from the pretrained one (Wortsman et al., "Robust fine
 """
 
 import copy
-import math
 import statistics
 from collections.abc import Callable, Iterable
 from functools import partial
-from typing import NamedTuple, cast
+from typing import cast
 
 import torch
 from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
 
 from mpc_sgft.learning.agent import Agent
 from mpc_sgft.learning.averaged import AveragedWeights
 from mpc_sgft.learning.buffer import make_buffer
+from mpc_sgft.learning.choice import Choice, Verdict, begins
 from mpc_sgft.learning.method import AbstractMethod, Gate
 from mpc_sgft.learning.observation_map import Sensed
 from mpc_sgft.learning.world_model import WorldModel
@@ -34,18 +35,6 @@ WITHOUT_GATE = Gate(
 )  # which command map acts is told without one too: the one that predicts better
 SIMULATED = 32  # episodes that tell how well the pretrained dynamics predict what they were made for
 SHARED = "observation", "action", "episode", "step", *(("next", k) for k in ("observation", "reward", "terminated"))
-
-
-class Verdict(NamedTuple):
-    """How the dynamics predicted a rollout that nobody had trained on."""
-
-    pretrained: float  # latent error over the horizon, mean over steps
-    fine_tuned: float
-    accepted: bool  # the fine-tuned parts act in the next rollout
-    mapped: float | None = None  # of the pretrained dynamics with the learned maps, where the gate asks
-    beneath: bool = True  # the dynamics beneath the maps are among the parts that act then
-    banded: float | None = None  # as `mapped`, with the command map that has a dead band
-    band_acts: bool = False  # this map acts then
 
 
 class Transfer:
@@ -96,7 +85,7 @@ class Transfer:
         self.averaged = AveragedWeights(agent.model, method.average_decay)
         self.acting: WorldModel = copy.deepcopy(agent.model)
         self.verdicts: list[Verdict] = []
-        self.starts: list[torch.Tensor] = []  # first observation of each rollout
+        self.starts: list[Tensor] = []  # first observation of each rollout
 
     def judge(self, steps: TensorDict) -> Verdict:
         """Test the dynamics on a rollout [T] before it is learned from, and decide who acts next."""
@@ -106,44 +95,52 @@ class Transfer:
 
         gate, last = self.method.gate, self.verdicts[-1] if self.verdicts else None
         limit = gate.excess * self._error_in_simulation() if gate and gate.excess else 0.0
-        mapped, banded = self._errors_of_maps(error) if limit or self._has_band else (None, None)
-        verdict = Verdict(error(self.pretrained), math.nan, gate is None, mapped, banded=banded)
-        seen = [*self.verdicts[1:], verdict]  # at the first rollout all are still the same
-        of_maps = [(v.banded, v.mapped) for v in seen if v.banded is not None and v.mapped is not None]
-        if last and of_maps:
-            verdict = verdict._replace(band_acts=self._better(of_maps, last.band_acts))
-            for model in (self.agent.model, self.averaged.model):
-                model.dynamics.band_acts.fill_(verdict.band_acts)
-        verdict = seen[-1] = verdict._replace(fine_tuned=error(self.averaged.model))
+        mapped, band, suspicion = self._choose_maps(error, asked=limit > 0)
+        verdict = Verdict(
+            error(self.pretrained), error(self.averaged.model), gate is None, True, mapped, band, suspicion
+        )
         if gate and last:
-            accepted = self._better([(v.fine_tuned, v.pretrained) for v in seen], last.accepted)
-            verdict = verdict._replace(accepted=accepted)
-            errors = [v.banded if verdict.band_acts else v.mapped for v in seen[-gate.memory :]]
-            beneath = not limit or statistics.geometric_mean(e for e in errors if e is not None) > limit
-            verdict = verdict._replace(beneath=beneath)
+            seen = [*self.verdicts[1:], verdict][-gate.memory :]  # at the first rollout all were still the same
+            accepted = begins([(v.fine_tuned, v.pretrained) for v in seen], last.accepted, gate.margin)
+            errors = [e for v in seen if (e := v.with_maps_of(verdict)) is not None]
+            beneath = not limit or statistics.geometric_mean(errors) > limit
+            verdict = verdict._replace(accepted=accepted, beneath=beneath)
         self.verdicts.append(verdict)
         return verdict
 
-    @property
-    def _has_band(self) -> bool:
-        return self.agent.model.dynamics.banded is not None
+    def _choose_maps(
+        self, error: Callable[[WorldModel], float], *, asked: bool
+    ) -> tuple[float | None, Choice | None, Choice | None]:
+        """What a verdict says of the maps; all models but the one that acts are told which of them act from now on.
 
-    def _errors_of_maps(self, error: Callable[[WorldModel], float]) -> tuple[float, float | None]:
-        """Of the pretrained dynamics with the learned maps, and with the command map that has a dead band."""
+        Args:
+            error: Of a model on this rollout.
+            asked: It is wanted even where there is nothing to choose.
+        """
+        has_band, margin = self.agent.model.dynamics.banded is not None, self.method.suspicion_margin
+        if not (asked or has_band or margin):
+            return None, None, None
         simulator = copy.deepcopy(self.averaged.model)
         self._simulate_beneath(simulator)
-        if not self._has_band:
-            return error(simulator), None
-        errors = []
-        for band_acts in (False, True):
-            simulator.dynamics.band_acts.fill_(band_acts)
-            errors.append(error(simulator))
-        return errors[0], errors[1]
+        gate, before = self.method.gate or WITHOUT_GATE, self.verdicts[1:]
 
-    def _better(self, errors: list[tuple[float, float]], acts: bool) -> bool:
-        """Whether the first of these pairs of errors, one a rollout, are clearly lower; of what acts: lower at all."""
-        gate = self.method.gate or WITHOUT_GATE
-        return clearly_better(errors[-gate.memory :], 1.0 if acts else gate.margin)
+        def choose(flag: Callable[[WorldModel], Tensor], choices: list[Choice | None], margin: float) -> Choice:
+            flag(simulator).fill_(False)
+            plain = error(simulator)
+            flag(simulator).fill_(True)
+            choice = Choice(plain, error(simulator), False)
+            if self.verdicts:
+                pairs = [(c.rival, c.plain) for c in [*choices, choice] if c][-gate.memory :]
+                acts = bool(choices and choices[-1] and choices[-1].rival_acts)
+                choice = choice._replace(rival_acts=begins(pairs, acts, margin))
+            for model in (simulator, self.agent.model, self.averaged.model):
+                flag(model).fill_(choice.rival_acts)
+            return choice
+
+        band = choose(lambda m: m.dynamics.band_acts, [v.band for v in before], gate.margin) if has_band else None
+        mapped = band.plain if band else error(simulator)
+        suspicion = choose(_suspects, [v.suspicion for v in before], margin) if margin else None
+        return mapped, band, suspicion
 
     def _error_in_simulation(self) -> float:
         """Of the pretrained dynamics; asked for at the first rollout, when nothing has trained yet."""
@@ -167,12 +164,7 @@ class Transfer:
             metrics = self.method.update(self.agent, self.batch(), starts=starts)
             self.averaged.follow(self.agent.model)
         self._hand_over(verdict)
-        metrics |= {"error_pretrained": verdict.pretrained, "error_fine_tuned": verdict.fine_tuned}
-        if verdict.mapped is not None:
-            metrics["error_mapped"] = verdict.mapped
-        if verdict.banded is not None:
-            metrics |= {"error_banded": verdict.banded, "band_acts": float(verdict.band_acts)}
-        return metrics
+        return metrics | verdict.metrics()
 
     def batch(self) -> TensorDictBase:
         """What an update learns from, [B, T]: real slices, and as many simulated ones if the method wants them."""
@@ -205,7 +197,7 @@ class Transfer:
             "averaged": self.averaged.state_dict(),
             "acting": self.acting.state_dict(),
             "starts": [x.clone() for x in self.starts],
-            "verdicts": [tuple(v) for v in self.verdicts],
+            "verdicts": [v.state() for v in self.verdicts],
             "simulated_error": self.simulated_error,
         }
 
@@ -219,14 +211,13 @@ class Transfer:
         self.averaged.load_state_dict(state["averaged"])
         self.acting.load_state_dict(state["acting"])
         self.starts = [x.to(self.agent.device) for x in state["starts"]]
-        self.verdicts = [Verdict(*v) for v in state["verdicts"]]
+        self.verdicts = [Verdict.from_state(v) for v in state["verdicts"]]
         self.simulated_error = state["simulated_error"]
 
 
-def clearly_better(errors: Iterable[tuple[float, float]], margin: float) -> bool:
-    """Whether the geometric mean of the first of each pair of errors is less than `margin` of that of the second."""
-    ours, others = zip(*errors, strict=True)
-    return math.prod(ours) < math.prod(margin * x for x in others)
+def _suspects(model: WorldModel) -> Tensor:
+    assert model.observation_map is not None  # methods that suspect sensors have one
+    return model.observation_map.suspects
 
 
 def mean_error(model: WorldModel, episodes: TensorDict, horizon: int) -> float:
@@ -235,7 +226,7 @@ def mean_error(model: WorldModel, episodes: TensorDict, horizon: int) -> float:
 
 
 @torch.inference_mode()
-def open_loop_error(model: WorldModel, steps: TensorDict, horizon: int) -> torch.Tensor:
+def open_loop_error(model: WorldModel, steps: TensorDict, horizon: int) -> Tensor:
     """Squared latent error of imagining the taken actions, [T, H]; nan where the episode ended before.
 
     Args:

@@ -181,11 +181,12 @@ class WorldModel(nn.Module):
 
     # -- what learning calls -------------------------------------------------------------------------------------------
 
-    def encode(self, observation: Tensor) -> Tensor:
-        """Latent of a raw observation, [..., O] -> [..., D]."""
+    def encode(self, observation: Tensor, *, suspected: bool = False) -> Tensor:
+        """Latent of a raw observation, [..., O] -> [..., D]; `suspected`: corrected in all that could be wrong."""
         seen = self.obs_dim - self.memory_dim
         if self.observation_map is not None:
-            observation = self.observation_map(observation)
+            correct = self.observation_map.suspected if suspected else self.observation_map
+            observation = correct(observation)
         code = by_blocks(lambda o: self.encoder(self.normalizer(o)[..., :seen]), observation)
         return torch.cat([code, observation[..., seen:]], -1) if self.memory_dim else code
 

@@ -10,13 +10,11 @@ from torch import Tensor
 
 from mpc_sgft.learning.agent import Agent, floats
 from mpc_sgft.learning.dynamics import Dynamics
-from mpc_sgft.learning.fit import Maps, Penalty, fit_dynamics
+from mpc_sgft.learning.fit import Maps, Penalty, Suspicion, fit_dynamics
 from mpc_sgft.learning.method import AbstractMethod, Gate, check_objective
 from mpc_sgft.learning.observation_map import Sensed
 from mpc_sgft.learning.slices import to_slices
 from mpc_sgft.learning.world_model import WorldModel
-
-DOUBT = 0.03  # sum of squared distances from the simulated starts, in spreads of an entry, beyond which it is doubted
 
 
 class SGFT(AbstractMethod):
@@ -43,16 +41,21 @@ class SGFT(AbstractMethod):
             each entry does nothing. It acts in place of the first once it predicted unseen rollouts clearly better, as
             the gate asks; without a gate, while it predicts them better.
         command_sparsity: Weight of the sum of their absolute differences from the identity, divided by the rollouts so
-            far: what is wrong with a machine is mostly one thing (the lasso: Tibshirani, JRSS B 1996).
+            far: what is wrong with a machine is mostly one thing (the lasso: Tibshirani, JRSS B 1996). The same of the
+            shifts that sensors are suspected of.
         observation_map: Also learn what the sensors should have said: a turn of what a camera sees, a shift of each
-            entry, once rollouts start where none does in simulation. Found like the command map, by what the
+            entry, where rollouts start where none does in simulation. Found like the command map, by what the
             simulator's dynamics can explain, and by where rollouts start.
         start_weight: Weight of the squared distance from there.
+        suspicion_margin: Where they start as they should, shifts are learned by what the simulator's dynamics can
+            explain alone: a puck moves when it is touched. They correct something once they lower the error on unseen
+            rollouts to this share; 0: never. Other physics can look a little like it, so this is less than the gate's.
         gate, gate_margin, gate_memory, gate_excess: Whether there is a gate, and its numbers (`Gate`).
         updates, slice_len, action_noise, average_decay, policy_share: As in `AbstractMethod`.
 
     Raises:
-        ValueError: If the horizon is not positive, rho lies outside (0, 1], or gate_excess is negative.
+        ValueError: If the horizon is not positive, rho lies outside (0, 1], gate_excess is negative, or
+            suspicion_margin lies outside [0, 1).
 
     Source: Yin, Westenbroek et al., ICLR 2025.
     """
@@ -73,6 +76,7 @@ class SGFT(AbstractMethod):
         command_sparsity: float,
         observation_map: bool,
         observation_lr: float,
+        suspicion_margin: float,
         start_weight: float,
         lr_decay: float,
         average_decay: float,
@@ -88,6 +92,8 @@ class SGFT(AbstractMethod):
         check_objective(horizon, rho)
         if gate_excess < 0:
             raise ValueError(f"gate_excess={gate_excess} must be 0 or more.")
+        if not 0 <= suspicion_margin < 1:
+            raise ValueError(f"suspicion_margin={suspicion_margin} must lie in [0, 1).")
         self.horizon, self.lr, self.policy_lr, self.command_lr = horizon, lr, policy_lr, command_lr
         self.entropy_coef, self.rho, self.anchor = entropy_coef, rho, anchor
         self.residual, self.command_map, self.command_band = residual, command_map, command_map and command_band
@@ -95,6 +101,7 @@ class SGFT(AbstractMethod):
         self.gate = Gate(gate_margin, gate_memory, gate_excess) if gate else None
         self.updates, self.slice_len, self.action_noise = updates, slice_len, action_noise
         self.observation_map, self.observation_lr, self.start_weight = observation_map, observation_lr, start_weight
+        self.suspicion_margin = suspicion_margin if observation_map else 0.0
         self.lr_decay, self.average_decay, self.policy_share = lr_decay, average_decay, policy_share
         self._pretrained: list[Tensor] = []  # of the dynamics, where the anchor holds them
         self._simulated: Dynamics | None = None  # as they were pretrained, with the command map of those that train
@@ -174,13 +181,20 @@ class SGFT(AbstractMethod):
             return Maps(parts, acting, penalties, rival)
         simulated = self._sensed.starts.to(starts.device)
         box = simulated.amin(0), simulated.amax(0)
-        sensors.doubt(starts, *box, DOUBT)
+        sensors.doubt(starts, *box)
 
         def doubt() -> Tensor:
             far = sensors.outside(starts, *box)
             return self.start_weight * far + self.anchor / len(starts) * sensors.size()
 
-        return Maps(parts, acting, (*penalties, Penalty("sensor_doubt", 1.0, doubt)), rival)
+        def suspected_doubt() -> Tensor:
+            return sensors.outside(starts, *box, suspected=True)
+
+        suspicion = None
+        if self.suspicion_margin:
+            few = Penalty("sensor_suspicion", self.command_sparsity / len(starts), sensors.suspicion)
+            suspicion = Suspicion(sensors.shift, (few, Penalty("suspected_doubt", self.start_weight, suspected_doubt)))
+        return Maps(parts, acting, (*penalties, Penalty("sensor_doubt", 1.0, doubt)), rival, suspicion)
 
     def _corrections(self, model: WorldModel) -> dict[str, float]:
         """What the observation map makes of the sensors, by name: a turn [rad], shifts in raw units."""

@@ -37,6 +37,7 @@ OURS |= dict(
     command_band=False,
     observation_map=False,
     observation_lr=5e-3,
+    suspicion_margin=0.0,
     start_weight=1.0,
     lr_decay=0.0,
     average_decay=0.0,

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from mpc_sgft.learning.fit import Maps, Penalty, fit_dynamics
+from mpc_sgft.learning.fit import Maps, Penalty, Suspicion, fit_dynamics
 from mpc_sgft.learning.observation_map import ObservationMap, Sensed
 from mpc_sgft.learning.slices import Slices
 from mpc_sgft.storage import checkpoint
@@ -62,6 +62,29 @@ def test_only_what_starts_elsewhere_is_corrected_and_points_turn_together():
     assert torch.allclose(sensors(observation), torch.tensor([[-0.5, -1.0, 1.5, 1.0]]), atol=1e-6)
 
 
+def test_what_is_suspected_corrects_where_it_is_believed_and_not_small():
+    sensors = ObservationMap([[0, 1]], torch.zeros(4), torch.tensor([1.0, 1.0, 2.0, 1.0]), blocks=1)
+    with torch.no_grad():
+        sensors.turn.fill_(math.pi)
+        sensors.shift.copy_(torch.tensor([0.5, 0.1, -0.2, 0.3]))  # 0.17 is small
+        sensors.doubted[3] = 1.0
+    seen = torch.zeros(1, 4)
+    torch.testing.assert_close(sensors(seen), torch.tensor([[0.0, 0.0, 0.0, 0.3]]))
+    sensors.suspects.fill_(True)
+    torch.testing.assert_close(sensors(seen), torch.tensor([[0.5, 0.0, -0.4, 0.3]]))
+    suspected = sensors.suspected(seen)
+    torch.testing.assert_close(suspected, torch.tensor([[0.5, 0.1, -0.4, 0.3]]))
+    suspected.sum().backward()  # doubted entries learn by what acts
+    assert sensors.shift.grad.tolist() == [1.0, 1.0, 2.0, 0.0]
+    assert sensors.suspicion().item() == pytest.approx(0.8)
+    assert sensors.size().item() == pytest.approx(math.pi**2 + 0.3**2)
+    box = (
+        torch.full((4,), -0.1),
+        torch.full((4,), 0.1),
+    )  # suspected starts lie outside by 0.4, 0, 0.3 / 2 and 0.2 spreads
+    assert sensors.outside(seen, *box, suspected=True).item() == pytest.approx(0.4**2 + 0.15**2 + 0.2**2)
+
+
 class Slope(nn.Module):
     """A puck that moves less the farther out it lies: so what it does tells where it is."""
 
@@ -69,24 +92,27 @@ class Slope(nn.Module):
         return z + 0.3 * action / (1 + 4 * z.square())
 
 
-@pytest.mark.parametrize("told", [True, False], ids=["by dynamics", "by starts"])
-def test_a_shifted_sensor_is_found(told: bool):
+@pytest.mark.parametrize("told", ["by dynamics", "by starts", "by suspicion"])
+def test_a_shifted_sensor_is_found(told: str):
     """Observations, here their own latents, lie 0.3 and -0.2 beside the truth."""
     agent = make_agent(sizes={"obs_dim": 2, "decode_dim": 2})
     model, offset = agent.model, torch.tensor([0.3, -0.2])
     model.add_observation_map([[0, 1]])
     agent.train_only(("dynamics", "observation_map"), lr=1e-3, policy_lr=1e-3, observation_lr=5e-3)
-    model.observation_map.doubted.fill_(1.0)
     sensors = model.observation_map
-    model.encode = lambda observation: sensors(observation)
+    sensors.doubted.fill_(told != "by suspicion")
+    model.encode = lambda o, suspected=False: sensors.suspected(o) if suspected else sensors(o)
     model.dynamics.forward = lambda z, action: z + 0 * model.dynamics.base[0].linear.bias.sum()
     generator = torch.Generator().manual_seed(0)
     starts = torch.tensor([[0.0, 0.0], [0.1, 0.1]]) + offset
 
     def doubt() -> Tensor:
-        return 0.0 * sensors.size() if told else sensors.outside(starts, torch.zeros(2), torch.full((2,), 0.1))
+        if told != "by starts":
+            return 0.0 * sensors.size()
+        return sensors.outside(starts, torch.zeros(2), torch.full((2,), 0.1))
 
-    own = Slope() if told else lambda z, action: z.detach()
+    own = (lambda z, action: z.detach()) if told == "by starts" else Slope()
+    suspicion = Suspicion(sensors.shift) if told == "by suspicion" else None
     for _ in range(400):
         action = 2 * torch.rand(4, 64, 2, generator=generator) - 1
         z = [2 * torch.rand(64, 2, generator=generator) - 1]
@@ -94,7 +120,12 @@ def test_a_shifted_sensor_is_found(told: bool):
             z.append(Slope()(z[-1], a))
         nothing = torch.zeros(4, 64)
         data = Slices(torch.stack(z) + offset, action, nothing, nothing.bool())
-        fit_dynamics(agent, data, rho=1.0, maps=Maps((sensors,), own, (Penalty("doubt", 1.0, doubt),)))
+        maps = Maps((sensors,), own, (Penalty("doubt", 1.0, doubt),), suspicion=suspicion)
+        fit_dynamics(agent, data, rho=1.0, maps=maps)
+    if suspicion:  # which has corrected nothing so far
+        assert torch.equal(model.encode(data.observation), data.observation)
+        sensors.suspects.fill_(True)
+        assert torch.allclose(model.encode(data.observation), torch.stack(z), atol=0.02)
     assert torch.allclose(sensors.shift * sensors.unit, -offset, atol=0.02)
     assert abs(sensors.turn.item()) < 0.05
 

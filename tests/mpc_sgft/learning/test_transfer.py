@@ -8,7 +8,9 @@ from omegaconf import OmegaConf
 from tensordict import TensorDict
 
 from mpc_sgft.learning.agent import Agent
-from mpc_sgft.learning.transfer import Transfer, Verdict, clearly_better, open_loop_error
+from mpc_sgft.learning.choice import Choice, Verdict, begins
+from mpc_sgft.learning.observation_map import Sensed
+from mpc_sgft.learning.transfer import Transfer, open_loop_error
 from mpc_sgft.learning.world_model import WorldModel
 from mpc_sgft.methods.sgft import SGFT
 from tests.mpc_sgft.learning.agents import SENSED
@@ -16,6 +18,7 @@ from tests.mpc_sgft.learning.agents import SENSED
 SIZES = {"obs_dim": 6, "action_dim": 2, "decode_dim": 3, "latent_dim": 16, "mlp_dim": 32, "enc_dim": 32, "num_q": 2}
 CONFIGS = Path(__file__).resolve().parents[3] / "configs"
 MEMORY = {"memory_dim": 2, "action_dim": 1, "obs_dim": 6, "decode_dim": 2}
+TIP = Sensed(SENSED.names[:2], SENSED.starts[:, :2])  # what is observed then
 
 
 def make_agent(sizes: dict | None = None, **changes) -> Agent:
@@ -32,6 +35,7 @@ def make_sgft(**changes) -> SGFT:
         "command_map": False,
         "command_band": False,
         "observation_map": False,
+        "suspicion_margin": 0.0,
         "lr_decay": 0.0,
         "average_decay": 0.0,
         "policy_share": 1.0,
@@ -64,7 +68,8 @@ def transfer(
     gate: bool = True, updates: int = 5, margin: float = 0.9, of_method: dict | None = None, **changes
 ) -> Transfer:
     method = make_sgft(lr=1e-2, gate=gate, updates=updates, gate_margin=margin, **(of_method or {}))
-    return Transfer(make_agent(**changes), method, SENSED, capacity=200, batch_size=16, seed=0)
+    sensed = TIP if changes.get("sizes") == MEMORY else SENSED
+    return Transfer(make_agent(**changes), method, sensed, capacity=200, batch_size=16, seed=0)
 
 
 def same(a: WorldModel, b: WorldModel) -> bool:
@@ -100,7 +105,7 @@ def test_who_acts_goes_on_while_it_is_better_at_all(share: float, acts: bool, go
 def test_one_odd_rollout_does_not_shut_the_gate(odd, accepted):
     """0.5^4 * 3 = 0.19 < 0.9^5 = 0.59 < 0.5^4 * 10, although the sums would say 5 > 0.9 * 5."""
     errors = [(error, 1.0) for error in (0.5, 0.5, 0.5, 0.5, odd)]
-    assert clearly_better(errors, margin=0.9) is accepted
+    assert begins(errors, acts=False, margin=0.9) is accepted
 
 
 def test_without_the_gate_what_trains_acts_at_once():
@@ -152,12 +157,12 @@ def test_a_dead_band_acts_once_it_tells_unseen_rollouts_better(gate: bool, acts:
 
     monkeypatch.setattr("mpc_sgft.learning.transfer.open_loop_error", error)
     steps = rollout(t.pretrained)
-    t.verdicts = [Verdict(1.0, 1.0, False), Verdict(1.0, 1.0, True, mapped=1.0, banded=share, band_acts=acts)]
+    t.verdicts = [Verdict(1.0, 1.0, False), Verdict(1.0, 1.0, True, mapped=1.0, band=Choice(1.0, share, acts))]
     for model in (t.agent.model, t.averaged.model):
         model.dynamics.band_acts.fill_(acts)
     metrics = t.learn(steps)
     wanted = share < (0.8 if gate and not acts else 1.0)
-    assert t.verdicts[-1].band_acts is wanted and metrics["band_acts"] == wanted
+    assert t.verdicts[-1].band.rival_acts is wanted and metrics["band_acts"] == wanted
     assert (metrics["error_mapped"], metrics["error_banded"]) == pytest.approx((1.0, share))
     assert all(bool(m.dynamics.band_acts) == wanted for m in (t.agent.model, t.averaged.model))
     accepted = wanted if gate else True
@@ -165,15 +170,66 @@ def test_a_dead_band_acts_once_it_tells_unseen_rollouts_better(gate: bool, acts:
     assert not t.pretrained.dynamics.band_acts
 
 
-def test_which_map_acts_is_kept():
-    numbers = {"command_map": True, "command_band": True}
+@pytest.mark.parametrize("acts", [True, False])
+@pytest.mark.parametrize("share", [0.45, 0.55, 1.1])
+def test_a_suspicion_acts_once_it_tells_unseen_rollouts_much_better(acts: bool, share: float, monkeypatch):
+    """By a margin of its own, or at all where it acts already."""
+    numbers = {"command_map": True, "observation_map": True, "suspicion_margin": 0.5}
+    t = transfer(updates=1, margin=0.8, sizes=MEMORY, of_method=numbers)
+
+    def error(model: WorldModel, *_) -> torch.Tensor:
+        return torch.full((2, 2), share if model.observation_map.suspects else 1.0)
+
+    monkeypatch.setattr("mpc_sgft.learning.transfer.open_loop_error", error)
+    t.verdicts = [Verdict(1.0, 1.0, False), Verdict(1.0, 1.0, True, suspicion=Choice(1.0, share, acts))]
+    metrics = t.learn(rollout(t.pretrained))
+    wanted = share < (1.0 if acts else 0.5)
+    assert t.verdicts[-1].suspicion == Choice(1.0, pytest.approx(share), wanted) and metrics["suspicion_acts"] == wanted
+    assert (metrics["error_mapped"], metrics["error_suspected"]) == pytest.approx((1.0, share))
+    assert all(bool(m.observation_map.suspects) == wanted for m in (t.agent.model, t.averaged.model, t.acting))
+    assert not t.pretrained.observation_map.suspects
+
+
+def test_the_first_rollout_tells_nothing_of_a_suspicion(monkeypatch):
+    """Then nothing has been learned, and both are the same but for rounding."""
+    t = transfer(updates=1, of_method={"observation_map": True, "suspicion_margin": 0.5})
+    monkeypatch.setattr(
+        "mpc_sgft.learning.transfer.open_loop_error",
+        lambda model, *_: torch.full((2, 2), 0.1 if model.observation_map.suspects else 1.0),
+    )
+    t.learn(rollout(t.pretrained))
+    assert t.verdicts[-1].suspicion == Choice(1.0, pytest.approx(0.1), False)
+    t.learn(rollout(t.pretrained))
+    assert t.verdicts[-1].suspicion.rival_acts
+
+
+def test_a_rollout_is_looked_at_with_the_maps_that_act_now():
+    band, suspicion = Choice(2.0, 3.0, False), Choice(4.0, 5.0, False)
+    verdict = Verdict(1.0, 1.0, True, mapped=2.0, band=band, suspicion=suspicion)
+    assert verdict.with_maps_of(verdict) == 2.0
+    assert verdict.with_maps_of(verdict._replace(band=Choice(0.0, 0.0, True))) == 3.0
+    assert verdict.with_maps_of(verdict._replace(suspicion=Choice(0.0, 0.0, True))) == 5.0
+
+
+def test_which_maps_act_is_kept():
+    numbers = {"command_map": True, "command_band": True, "observation_map": True, "suspicion_margin": 0.5}
     t = transfer(sizes=MEMORY, of_method=numbers)
     t.learn(rollout(t.pretrained))
-    t.agent.model.dynamics.band_acts.fill_(True)
-    t.acting.dynamics.band_acts.fill_(True)
+    for model in (t.agent.model, t.acting):
+        model.dynamics.band_acts.fill_(True)
+        model.observation_map.suspects.fill_(True)
     again = transfer(sizes=MEMORY, of_method=numbers)
     again.load_state_dict(t.state_dict())
-    assert again.agent.model.dynamics.band_acts and again.acting.dynamics.band_acts and again.verdicts == t.verdicts
+    for model in (again.agent.model, again.acting):
+        assert model.dynamics.band_acts and model.observation_map.suspects
+    assert again.verdicts == t.verdicts and isinstance(again.verdicts[0].suspicion, Choice)
+
+
+@pytest.mark.parametrize("margin", [-0.1, 1.0])
+def test_a_suspicion_must_lower_the_error(margin: float):
+    with pytest.raises(ValueError, match=rf"suspicion_margin={margin} must lie in \[0, 1\)"):
+        make_sgft(suspicion_margin=margin)
+    assert make_sgft(suspicion_margin=0.5, observation_map=False).suspicion_margin == 0
 
 
 def test_a_negative_excess_is_refused_and_without_a_gate_there_is_none():
