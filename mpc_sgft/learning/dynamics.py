@@ -46,11 +46,13 @@ class Dynamics(nn.Module):
     Until `add_command_map` c is u. From then on a `CommandMap` is learned, from the identity on: a gain, a rotation, a
     drift, a delay, a lag, a few numbers that hold wherever the robot is. Commands older than the memory count as its
     oldest. `add_command_band` adds a second map, with a dead band, which learns beside it and acts in its place while
-    `band_acts`: where all commands are large, a dead band and a weak arm look alike.
+    `band_acts`: where all commands are large, a dead band and a weak arm look alike. A third, `joint`, learns together
+    with what sensors are suspected of, and acts with it: a sensor that lies may look like a weak arm too.
     `add_residual` adds a correction that starts at zero.
     """
 
-    band_acts: Tensor  # bool scalar
+    band_acts: Tensor  # bool scalars
+    joint_acts: Tensor
 
     def __init__(self, code_dim: int, memory_dim: int, action_dim: int, mlp_dim: int, simnorm_dim: int) -> None:
         super().__init__()
@@ -59,6 +61,7 @@ class Dynamics(nn.Module):
         self.residual: nn.Module | None = None
         self.command: CommandMap | None = None
         self.banded: CommandMap | None = None
+        self.joint: CommandMap | None = None
         self.code_dim, self.memory_dim, self.simnorm_dim = code_dim, memory_dim, simnorm_dim
 
     def forward(self, z: Tensor, action: Tensor) -> Tensor:
@@ -80,11 +83,18 @@ class Dynamics(nn.Module):
 
     def _made(self, command: CommandMap, told: Tensor) -> Tensor:
         """What the map that acts makes of commands [..., K]; on a GPU of both, so that recorded graphs follow it."""
-        if self.banded is None:
-            return command(told)
-        if told.is_cuda:
-            return torch.where(self.band_acts, self.banded(told), command(told))
-        return (self.banded if self.band_acts else command)(told)
+        rivals = [(x, self.band_acts) for x in (self.banded,) if x is not None]  # the later ones come first
+        rivals += [(x, self.joint_acts) for x in (self.joint,) if x is not None]
+        if not told.is_cuda:
+            return next((rival for rival, acts in reversed(rivals) if acts), command)(told)
+        made = command(told)
+        for rival, acts in rivals:
+            made = torch.where(acts, rival(told), made)
+        return made
+
+    def command_maps(self) -> list[CommandMap]:
+        """All there are."""
+        return [x for x in (self.command, self.banded, self.joint) if x is not None]
 
     def as_simulated(self, z: Tensor) -> Tensor:
         """The latent with its commands as the machine realised them: what the simulator would have called them."""

@@ -22,14 +22,16 @@ class Penalty(NamedTuple):
 
 
 class Suspicion(NamedTuple):
-    """What the sensors could be suspected of beside what the observation map corrects, learned without acting.
+    """What sensors could be suspected of, as another explanation than the maps.
 
     Attributes:
-        shift: Of each entry, [R]: what learns.
-        penalties: On it.
+        parameters: What learns: shifts, and the command map that goes with them.
+        simulated: The simulator's dynamics with this command map.
+        penalties: On them.
     """
 
-    shift: nn.Parameter
+    parameters: tuple[nn.Parameter, ...]
+    simulated: Dynamics
     penalties: tuple[Penalty, ...] = ()
 
 
@@ -41,10 +43,10 @@ class Maps(NamedTuple):
 
     Attributes:
         parts: What learns.
-        simulated: The simulator's dynamics, with the command map that acts.
+        simulated: The simulator's dynamics, with the command map that acts, or would without a suspicion.
         penalties: On the maps.
         rival: The simulator's dynamics, with a command map that learns beside it; nothing else learns by these.
-        suspicion: What the observation map learns beside what it corrects, by `simulated` as it is.
+        suspicion: Learns beside them; while it acts, the maps learn as if it did not.
     """
 
     parts: tuple[nn.Module, ...]
@@ -94,14 +96,15 @@ def fit_dynamics(
     metrics = {"consistency_loss": error(agent.model.dynamics, encoded)}
     total = with_penalties(metrics["consistency_loss"], (penalty,) if penalty else ())
     if maps is not None:
-        metrics["map_loss"] = error(maps.simulated, seen)
+        trusted = agent.model.encode(data.observation, suspected=False) if maps.suspicion else seen
+        metrics["map_loss"] = error(maps.simulated, trusted)
         of_maps = with_penalties(metrics["map_loss"], maps.penalties)
         if maps.rival is not None:
-            metrics["rival_loss"] = error(maps.rival, encoded)
+            metrics["rival_loss"] = error(maps.rival, trusted.detach())
             of_maps = of_maps + metrics["rival_loss"]
         if maps.suspicion is not None:
             suspected = agent.model.encode(data.observation, suspected=True)
-            metrics["suspicion_loss"] = error(maps.simulated, suspected)
+            metrics["suspicion_loss"] = error(maps.suspicion.simulated, suspected)
             of_suspicion = with_penalties(metrics["suspicion_loss"], maps.suspicion.penalties)
     check_finite(metrics)
     agent.optimizers.model.zero_grad()
@@ -110,7 +113,7 @@ def fit_dynamics(
     if maps is not None:
         (scale * of_maps).backward(inputs=[p for part in maps.parts for p in part.parameters()])
         if maps.suspicion is not None:
-            (scale * of_suspicion).backward(inputs=[maps.suspicion.shift])
+            (scale * of_suspicion).backward(inputs=[*maps.suspicion.parameters])
     metrics["grad_norm"] = torch.nn.utils.clip_grad_norm_(agent.optimizers.trained, agent.grad_clip, foreach=True)
     agent.optimizers.model.step()
     return metrics, encoded

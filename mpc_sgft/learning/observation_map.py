@@ -35,7 +35,7 @@ class ObservationMap(nn.Module):
     episodes start: nothing has moved yet, so if it looks odd there, no dynamics can be to blame. Without that a map
     explains whatever the dynamics do otherwise than in simulation, and moves a nail that only sits harder. A puck that
     is seen beside its place may still start where others do; what moves it tells then. So the other entries have shifts
-    too (`suspected`), which correct nothing until `suspects` says that they do: only those that are not small.
+    too, which correct nothing until `suspects` says that they do: only those that are not small.
 
     Args:
         points: Pairs of entries that are the x and y of a point, [P, 2].
@@ -70,17 +70,19 @@ class ObservationMap(nn.Module):
         corrected = self.doubted.bool() | (self.suspects & (self.shift.square() > DOUBT))
         return torch.where(corrected, self.shift, 0.0) * self.unit
 
-    def forward(self, observation: Tensor) -> Tensor:
-        """Corrected observations, [..., O] -> [..., O]; past actions stay as they are."""
-        return self._correct(observation, self.shifted)
+    def forward(self, observation: Tensor, *, suspected: bool | None = None) -> Tensor:
+        """Corrected observations, [..., O] -> [..., O]; past actions stay as they are.
 
-    def suspected(self, observation: Tensor) -> Tensor:
-        """Observations corrected in all entries, [..., O] -> [..., O]; only those that are not doubted learn by it."""
-        shift = torch.where(self.doubted.bool(), self.shift.detach(), self.shift)
-        return self._correct(observation, shift * self.unit)
-
-    def _correct(self, observation: Tensor, shifted: Tensor) -> Tensor:
-        size = len(self.unit)
+        Args:
+            observation: As seen.
+            suspected: False: as if nothing were suspected. True: in all entries; only those that are not doubted learn
+                by it. None: in those that are corrected now.
+        """
+        size, doubted = len(self.unit), self.doubted.bool()
+        shifted = self.shifted
+        if suspected is not None:
+            shift = torch.where(doubted, self.shift.detach(), self.shift) if suspected else self.doubted * self.shift
+            shifted = shift * self.unit
         seen = observation[..., : self.blocks * size].unflatten(-1, (self.blocks, size))
         right = seen + shifted
         if self.points:
@@ -108,14 +110,13 @@ class ObservationMap(nn.Module):
         """
         self.doubted.copy_(self._outside(starts[..., : len(self.unit)], low, high).sum(0) > enough)
 
-    def outside(self, starts: Tensor, low: Tensor, high: Tensor, *, suspected: bool = False) -> Tensor:
+    def outside(self, starts: Tensor, low: Tensor, high: Tensor, *, suspected: bool | None = None) -> Tensor:
         """How far corrected starts [N, O] lie outside a box of R entries, in units, mean over starts, scalar.
 
         Distances are squared up to one unit and linear beyond (Huber, 1964): an entry that hardly moved in simulation,
         and so has a tiny unit, must not drown the others.
         """
-        corrected = self.suspected(starts) if suspected else self(starts)
-        return self._outside(corrected[..., : len(self.unit)], low, high).mean(0).sum()
+        return self._outside(self(starts, suspected=suspected)[..., : len(self.unit)], low, high).mean(0).sum()
 
     def _outside(self, seen: Tensor, low: Tensor, high: Tensor) -> Tensor:
         far = ((seen - high).clamp_min(0) + (low - seen).clamp_min(0)) / self.unit

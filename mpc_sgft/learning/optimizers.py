@@ -42,7 +42,7 @@ class Optimizers:
         observation_lr: float | None = None,
         recorded: bool = False,
     ) -> None:
-        of_commands = [part for part in (model.dynamics.command, model.dynamics.banded) if part is not None]
+        of_commands = model.dynamics.command_maps()
         maps = (*((part, command_lr) for part in of_commands), (model.observation_map, observation_lr))
         groups = [{"params": [*part.parameters()], "lr": lr if own is None else own} for part, own in maps if part]
         command = [p for part in of_commands for p in part.parameters()]

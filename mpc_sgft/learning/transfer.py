@@ -124,22 +124,27 @@ class Transfer:
         self._simulate_beneath(simulator)
         gate, before = self.method.gate or WITHOUT_GATE, self.verdicts[1:]
 
-        def choose(flag: Callable[[WorldModel], Tensor], choices: list[Choice | None], margin: float) -> Choice:
-            flag(simulator).fill_(False)
-            plain = error(simulator)
-            flag(simulator).fill_(True)
-            choice = Choice(plain, error(simulator), False)
+        def choose(
+            set_acting: Callable[[WorldModel, bool], object], choices: list[Choice | None], margin: float
+        ) -> Choice:
+            errors = []
+            for acts in (False, True):
+                set_acting(simulator, acts)
+                errors.append(error(simulator))
+            choice = Choice(errors[0], errors[1], False)
             if self.verdicts:
                 pairs = [(c.rival, c.plain) for c in [*choices, choice] if c][-gate.memory :]
                 acts = bool(choices and choices[-1] and choices[-1].rival_acts)
                 choice = choice._replace(rival_acts=begins(pairs, acts, margin))
             for model in (simulator, self.agent.model, self.averaged.model):
-                flag(model).fill_(choice.rival_acts)
+                set_acting(model, choice.rival_acts)
             return choice
 
-        band = choose(lambda m: m.dynamics.band_acts, [v.band for v in before], gate.margin) if has_band else None
+        if margin:
+            simulator.suspect(False)  # until it is chosen
+        band = choose(WorldModel.use_band, [v.band for v in before], gate.margin) if has_band else None
         mapped = band.plain if band else error(simulator)
-        suspicion = choose(_suspects, [v.suspicion for v in before], margin) if margin else None
+        suspicion = choose(WorldModel.suspect, [v.suspicion for v in before], margin) if margin else None
         return mapped, band, suspicion
 
     def _error_in_simulation(self) -> float:
@@ -213,11 +218,6 @@ class Transfer:
         self.starts = [x.to(self.agent.device) for x in state["starts"]]
         self.verdicts = [Verdict.from_state(v) for v in state["verdicts"]]
         self.simulated_error = state["simulated_error"]
-
-
-def _suspects(model: WorldModel) -> Tensor:
-    assert model.observation_map is not None  # methods that suspect sensors have one
-    return model.observation_map.suspects
 
 
 def mean_error(model: WorldModel, episodes: TensorDict, horizon: int) -> float:

@@ -181,12 +181,11 @@ class WorldModel(nn.Module):
 
     # -- what learning calls -------------------------------------------------------------------------------------------
 
-    def encode(self, observation: Tensor, *, suspected: bool = False) -> Tensor:
-        """Latent of a raw observation, [..., O] -> [..., D]; `suspected`: corrected in all that could be wrong."""
+    def encode(self, observation: Tensor, *, suspected: bool | None = None) -> Tensor:
+        """Latent of a raw observation, [..., O] -> [..., D]; `suspected` as in the observation map."""
         seen = self.obs_dim - self.memory_dim
         if self.observation_map is not None:
-            correct = self.observation_map.suspected if suspected else self.observation_map
-            observation = correct(observation)
+            observation = self.observation_map(observation, suspected=suspected)
         code = by_blocks(lambda o: self.encoder(self.normalizer(o)[..., :seen]), observation)
         return torch.cat([code, observation[..., seen:]], -1) if self.memory_dim else code
 
@@ -293,6 +292,37 @@ class WorldModel(nn.Module):
         dynamics.banded = self._new_command_map(band=True)
         dynamics.register_buffer("band_acts", torch.tensor(False, device=dynamics.banded.bias.device))
         return dynamics.banded
+
+    def add_suspicion(self) -> None:
+        """Let another command map learn together with what sensors are suspected of; nothing of it acts yet.
+
+        Without a command map there is nothing to add: what is suspected then explains alone.
+
+        Raises:
+            ValueError: If there is one already, or no observation map.
+        """
+        dynamics = self.dynamics
+        if self.observation_map is None or dynamics.joint is not None:
+            raise ValueError("Only an observation map suspects: add_observation_map, then add_suspicion, each once.")
+        if dynamics.command is not None:
+            dynamics.joint = self._new_command_map(band=False)
+            dynamics.register_buffer("joint_acts", torch.tensor(False, device=dynamics.joint.bias.device))
+
+    def use_band(self, acts: bool) -> None:
+        """Whether the command map with a dead band acts in place of the first."""
+        self.dynamics.band_acts.fill_(acts)
+
+    def suspect(self, acts: bool) -> None:
+        """Whether what sensors are suspected of acts, with the command map that goes with it.
+
+        Raises:
+            ValueError: If there is no observation map.
+        """
+        if self.observation_map is None:
+            raise ValueError("Only an observation map suspects sensors: add_observation_map makes one.")
+        self.observation_map.suspects.fill_(acts)
+        if self.dynamics.joint is not None:
+            self.dynamics.joint_acts.fill_(acts)
 
     def _new_command_map(self, *, band: bool) -> CommandMap:
         sizes = self.action_dim + self.memory_dim, self.action_dim

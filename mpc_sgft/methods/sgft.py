@@ -12,7 +12,7 @@ from mpc_sgft.learning.agent import Agent, floats
 from mpc_sgft.learning.dynamics import Dynamics
 from mpc_sgft.learning.fit import Maps, Penalty, Suspicion, fit_dynamics
 from mpc_sgft.learning.method import AbstractMethod, Gate, check_objective
-from mpc_sgft.learning.observation_map import Sensed
+from mpc_sgft.learning.observation_map import ObservationMap, Sensed
 from mpc_sgft.learning.slices import to_slices
 from mpc_sgft.learning.world_model import WorldModel
 
@@ -48,8 +48,9 @@ class SGFT(AbstractMethod):
             simulator's dynamics can explain, and by where rollouts start.
         start_weight: Weight of the squared distance from there.
         suspicion_margin: Where they start as they should, shifts are learned by what the simulator's dynamics can
-            explain alone: a puck moves when it is touched. They correct something once they lower the error on unseen
-            rollouts to this share; 0: never. Other physics can look a little like it, so this is less than the gate's.
+            explain alone, with a command map of their own: a puck moves when it is touched. They correct something once
+            they lower the error on unseen rollouts to this share; 0: never. Other physics can look a little like it, so
+            this is less than the gate's.
         gate, gate_margin, gate_memory, gate_excess: Whether there is a gate, and its numbers (`Gate`).
         updates, slice_len, action_noise, average_decay, policy_share: As in `AbstractMethod`.
 
@@ -106,6 +107,7 @@ class SGFT(AbstractMethod):
         self._pretrained: list[Tensor] = []  # of the dynamics, where the anchor holds them
         self._simulated: Dynamics | None = None  # as they were pretrained, with the command map of those that train
         self._banded: Dynamics | None = None  # the same with the map that has a dead band
+        self._joint: Dynamics | None = None  # the same with the map that goes with what sensors are suspected of
 
     def take_over(self, agent: Agent, sensed: Sensed) -> None:
         model, parts = agent.model, ("dynamics", "policy_head")
@@ -125,6 +127,10 @@ class SGFT(AbstractMethod):
             if model.observation_map is None:
                 model.add_observation_map(sensed.points())
             parts += ("observation_map",)
+            if self.suspicion_margin and self.command_map:
+                if model.dynamics.joint is None:
+                    model.add_suspicion()
+                parts += ("dynamics.joint",)
         agent.train_only(
             parts,
             lr=self.lr,
@@ -136,11 +142,11 @@ class SGFT(AbstractMethod):
         self._pretrained = [p.detach().clone() for p in agent.dynamics_parameters()]
         if self.command_map or self.observation_map:
             self._simulated = copy.deepcopy(model.dynamics).requires_grad_(False)
-            self._simulated.residual = self._simulated.banded = None
+            self._simulated.residual = self._simulated.banded = self._simulated.joint = None
             self._simulated.command = model.dynamics.command
-            if self.command_band:
-                self._banded = copy.deepcopy(self._simulated)
-                self._banded.base, self._banded.command = self._simulated.base, model.dynamics.banded
+            self._banded, self._joint = copy.deepcopy(self._simulated), copy.deepcopy(self._simulated)
+            self._banded.base, self._banded.command = self._simulated.base, model.dynamics.banded
+            self._joint.base, self._joint.command = self._simulated.base, model.dynamics.joint
 
     def update(self, agent: Agent, batch: TensorDictBase, *, starts: Tensor) -> dict[str, float]:
         def distance() -> Tensor:
@@ -163,7 +169,7 @@ class SGFT(AbstractMethod):
         """How command map and observation map learn, given the first observation of each rollout [R, O]."""
         if self._simulated is None:
             return None
-        acting, rival = self._simulated, self._banded
+        acting, rival = self._simulated, self._banded if self.command_band else None
         if rival is not None and bool(model.dynamics.band_acts):
             acting, rival = rival, acting
         told = (acting, rival) if self.command_map else ()
@@ -176,7 +182,7 @@ class SGFT(AbstractMethod):
 
         penalties: tuple[Penalty, ...] = ()
         if commands and self.command_sparsity:
-            penalties += (Penalty("command_change", self.command_sparsity / len(starts), change),)
+            penalties += (Penalty("command_change", self._sparse(starts), change),)
         if sensors is None:
             return Maps(parts, acting, penalties, rival)
         simulated = self._sensed.starts.to(starts.device)
@@ -184,17 +190,32 @@ class SGFT(AbstractMethod):
         sensors.doubt(starts, *box)
 
         def doubt() -> Tensor:
-            far = sensors.outside(starts, *box)
+            far = sensors.outside(starts, *box, suspected=False)
             return self.start_weight * far + self.anchor / len(starts) * sensors.size()
 
-        def suspected_doubt() -> Tensor:
+        suspicion = self._suspicion(sensors, starts, box) if self.suspicion_margin else None
+        return Maps(parts, acting, (*penalties, Penalty("sensor_doubt", 1.0, doubt)), rival, suspicion)
+
+    def _suspicion(self, sensors: ObservationMap, starts: Tensor, box: tuple[Tensor, Tensor]) -> Suspicion:
+        """What learns of the sensors by what moves, given the first observations [R, O] and where they may lie."""
+        assert self._joint is not None  # there is an observation map
+        command = self._joint.command
+
+        def far() -> Tensor:
             return sensors.outside(starts, *box, suspected=True)
 
-        suspicion = None
-        if self.suspicion_margin:
-            few = Penalty("sensor_suspicion", self.command_sparsity / len(starts), sensors.suspicion)
-            suspicion = Suspicion(sensors.shift, (few, Penalty("suspected_doubt", self.start_weight, suspected_doubt)))
-        return Maps(parts, acting, (*penalties, Penalty("sensor_doubt", 1.0, doubt)), rival, suspicion)
+        def few() -> Tensor:
+            return sensors.suspicion() + (0.0 if command is None else command.change())
+
+        penalties = (
+            Penalty("suspected_doubt", self.start_weight, far),
+            Penalty("suspected_change", self._sparse(starts), few),
+        )
+        parameters = (sensors.shift, *([] if command is None else command.parameters()))
+        return Suspicion(parameters, self._joint, penalties)
+
+    def _sparse(self, starts: Tensor) -> float:
+        return self.command_sparsity / len(starts)
 
     def _corrections(self, model: WorldModel) -> dict[str, float]:
         """What the observation map makes of the sensors, by name: a turn [rad], shifts in raw units."""

@@ -56,6 +56,7 @@ def describe(cfg: DictConfig, model: WorldModel, extra: Mapping[str, Any] | None
         "command_map": model.dynamics.command is not None,
         "command_band": model.dynamics.banded is not None,
         "observation_map": None if model.observation_map is None else model.observation_map.points,
+        "suspicion": model.dynamics.joint is not None,
         "config": config,
         **(extra or {}),
     }
@@ -125,6 +126,8 @@ def load(
             model.add_command_band()
         if meta.get("observation_map") is not None:
             model.add_observation_map(meta["observation_map"])
+        if meta.get("suspicion"):
+            model.add_suspicion()
         model.load_state_dict(tensors)
         model.value_range = float(meta.get("value_range", EARLIER_RANGE))
     except (TypeError, ValueError, RuntimeError) as err:

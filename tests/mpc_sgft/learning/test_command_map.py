@@ -98,6 +98,56 @@ def test_one_of_two_command_maps_acts() -> None:
     assert (dynamics.realised(sent) == 0.75).all()
 
 
+def test_the_map_that_goes_with_a_suspicion_acts_before_both() -> None:
+    model, sent = two_maps(), torch.ones(1, 3 * A)
+    model.add_observation_map([])
+    model.add_suspicion()
+    with torch.no_grad():
+        model.dynamics.joint.bias.fill_(2.0)
+    for band, wanted in ((False, 2.0), (True, 0.75)):
+        model.use_band(band)
+        assert (model.dynamics.realised(sent) == wanted).all()
+        model.suspect(True)
+        assert model.observation_map.suspects and (model.dynamics.realised(sent) == 3.0).all()
+        model.suspect(False)
+        assert not model.observation_map.suspects
+    with pytest.raises(ValueError, match="each once"):
+        model.add_suspicion()
+
+
+def test_a_suspicion_needs_an_observation_map() -> None:
+    model = two_maps()
+    with pytest.raises(ValueError, match="add_observation_map"):
+        model.add_suspicion()
+    with pytest.raises(ValueError, match="add_observation_map"):
+        model.suspect(True)
+
+
+@pytest.mark.parametrize("suspects", [True, False])
+def test_a_suspicion_learns_beside_the_maps_and_they_as_if_there_were_none(suspects: bool) -> None:
+    """Slopes of the maps are the same whatever is suspected, and those of what is suspected whatever the maps are."""
+    slopes = []
+    for far in (0.0, 5.0):
+        for shift in (0.0, 0.5):
+            agent = make_agent(grad_clip=1e9)  # which all share
+            numbers = {"command_map": True, "command_band": True, "observation_map": True, "suspicion_margin": 0.5}
+            update = hand_over(agent, **numbers, slice_len=T)
+            dynamics, sensors = agent.model.dynamics, agent.model.observation_map
+            agent.model.suspect(suspects)
+            dynamics.command.bias.data.fill_(far)
+            sensors.shift.data.fill_(shift)
+            sensors.doubt = lambda *_: None  # nothing is doubted
+            update(make_batch(steps=T))
+            state = agent.optimizers.model.state
+            slopes.append([state[p]["exp_avg"].clone() for p in (dynamics.command.weight, dynamics.joint.weight)])
+            slopes[-1].append(state[sensors.shift]["exp_avg"].clone())
+    (plain, joint, shift), (same, _, _), (_, joint_far, shift_far), _ = slopes
+    torch.testing.assert_close(plain, same)
+    torch.testing.assert_close(joint, joint_far)
+    torch.testing.assert_close(shift, shift_far)
+    assert plain.abs().max() > 0 and joint.abs().max() > 0 and shift.abs().max() > 0
+
+
 @pytest.mark.gpu
 def test_what_was_recorded_follows_the_map_that_acts() -> None:
     dynamics, sent = two_maps().cuda().dynamics, torch.ones(1, 3 * A, device="cuda")

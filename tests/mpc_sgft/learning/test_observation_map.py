@@ -72,7 +72,8 @@ def test_what_is_suspected_corrects_where_it_is_believed_and_not_small():
     torch.testing.assert_close(sensors(seen), torch.tensor([[0.0, 0.0, 0.0, 0.3]]))
     sensors.suspects.fill_(True)
     torch.testing.assert_close(sensors(seen), torch.tensor([[0.5, 0.0, -0.4, 0.3]]))
-    suspected = sensors.suspected(seen)
+    torch.testing.assert_close(sensors(seen, suspected=False), torch.tensor([[0.0, 0.0, 0.0, 0.3]]))
+    suspected = sensors(seen, suspected=True)
     torch.testing.assert_close(suspected, torch.tensor([[0.5, 0.1, -0.4, 0.3]]))
     suspected.sum().backward()  # doubted entries learn by what acts
     assert sensors.shift.grad.tolist() == [1.0, 1.0, 2.0, 0.0]
@@ -101,7 +102,7 @@ def test_a_shifted_sensor_is_found(told: str):
     agent.train_only(("dynamics", "observation_map"), lr=1e-3, policy_lr=1e-3, observation_lr=5e-3)
     sensors = model.observation_map
     sensors.doubted.fill_(told != "by suspicion")
-    model.encode = lambda o, suspected=False: sensors.suspected(o) if suspected else sensors(o)
+    model.encode = lambda o, suspected=None: sensors(o, suspected=suspected)
     model.dynamics.forward = lambda z, action: z + 0 * model.dynamics.base[0].linear.bias.sum()
     generator = torch.Generator().manual_seed(0)
     starts = torch.tensor([[0.0, 0.0], [0.1, 0.1]]) + offset
@@ -112,7 +113,7 @@ def test_a_shifted_sensor_is_found(told: str):
         return sensors.outside(starts, torch.zeros(2), torch.full((2,), 0.1))
 
     own = (lambda z, action: z.detach()) if told == "by starts" else Slope()
-    suspicion = Suspicion(sensors.shift) if told == "by suspicion" else None
+    suspicion = Suspicion((sensors.shift,), own) if told == "by suspicion" else None
     for _ in range(400):
         action = 2 * torch.rand(4, 64, 2, generator=generator) - 1
         z = [2 * torch.rand(64, 2, generator=generator) - 1]

@@ -186,7 +186,8 @@ def test_a_suspicion_acts_once_it_tells_unseen_rollouts_much_better(acts: bool, 
     wanted = share < (1.0 if acts else 0.5)
     assert t.verdicts[-1].suspicion == Choice(1.0, pytest.approx(share), wanted) and metrics["suspicion_acts"] == wanted
     assert (metrics["error_mapped"], metrics["error_suspected"]) == pytest.approx((1.0, share))
-    assert all(bool(m.observation_map.suspects) == wanted for m in (t.agent.model, t.averaged.model, t.acting))
+    for model in (t.agent.model, t.averaged.model, t.acting):
+        assert bool(model.observation_map.suspects) == bool(model.dynamics.joint_acts) == wanted
     assert not t.pretrained.observation_map.suspects
 
 
@@ -216,12 +217,12 @@ def test_which_maps_act_is_kept():
     t = transfer(sizes=MEMORY, of_method=numbers)
     t.learn(rollout(t.pretrained))
     for model in (t.agent.model, t.acting):
-        model.dynamics.band_acts.fill_(True)
-        model.observation_map.suspects.fill_(True)
+        model.use_band(True)
+        model.suspect(True)
     again = transfer(sizes=MEMORY, of_method=numbers)
     again.load_state_dict(t.state_dict())
     for model in (again.agent.model, again.acting):
-        assert model.dynamics.band_acts and model.observation_map.suspects
+        assert model.dynamics.band_acts and model.observation_map.suspects and model.dynamics.joint_acts
     assert again.verdicts == t.verdicts and isinstance(again.verdicts[0].suspicion, Choice)
 
 

@@ -27,7 +27,10 @@ def saved(path, residual=False, band=False):
     if band:
         model.add_command_map()
         torch.nn.init.uniform_(model.add_command_band().band)
-        model.dynamics.band_acts.fill_(True)
+        model.use_band(True)
+        model.add_observation_map([[0, 1]])
+        model.add_suspicion()
+        model.suspect(True)
     checkpoint.save(path, model, checkpoint.describe(CFG, model, extra={"transitions": 7}))
     return model
 
