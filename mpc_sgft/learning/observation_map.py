@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 SUFFIXES = "_x", "_y"
-DOUBT = 0.03  # squared distance, in spreads of an entry, that matters: of starts from the simulated, of a shift from 0
+SMALL = 0.1  # shift of an entry, in its spreads, up to which a suspicion corrects nothing
 
 
 class Sensed(NamedTuple):
@@ -67,7 +67,7 @@ class ObservationMap(nn.Module):
     @property
     def shifted(self) -> Tensor:
         """By how much entries are shifted, raw units [R]."""
-        corrected = self.doubted.bool() | (self.suspects & (self.shift.square() > DOUBT))
+        corrected = self.doubted.bool() | (self.suspects & (self.shift.abs() > SMALL))
         return torch.where(corrected, self.shift, 0.0) * self.unit
 
     def forward(self, observation: Tensor, *, suspected: bool | None = None) -> Tensor:
@@ -103,7 +103,7 @@ class ObservationMap(nn.Module):
         return ((1 - self.doubted) * self.shift).abs().sum()
 
     @torch.no_grad()
-    def doubt(self, starts: Tensor, low: Tensor, high: Tensor, enough: float = DOUBT) -> None:
+    def doubt(self, starts: Tensor, low: Tensor, high: Tensor, enough: float) -> None:
         """Doubt the entries whose starts [N, O], as they were seen, lie outside a box by more than `enough` in sum.
 
         A sum: one start that is clearly outside stays so, however many lie within.

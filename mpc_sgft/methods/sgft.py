@@ -16,6 +16,8 @@ from mpc_sgft.learning.observation_map import ObservationMap, Sensed
 from mpc_sgft.learning.slices import to_slices
 from mpc_sgft.learning.world_model import WorldModel
 
+DOUBT = 0.03  # sum of squared distances from the simulated starts, in spreads of an entry, beyond which it is doubted
+
 
 class SGFT(AbstractMethod):
     """Encoder, reward and critic stay as they were pretrained; the dynamics and the policy prior train.
@@ -32,9 +34,11 @@ class SGFT(AbstractMethod):
         lr_decay: With r rollouts they are r^-lr_decay of that, so that many rollouts do not move them about.
         entropy_coef: Weight of the policy's entropy in its objective, fixed.
         rho: Weight of step t of the dynamics loss is rho^t.
-        anchor: Weight of the squared distance of the dynamics' parameters from the pretrained ones, divided by the
-            rollouts so far: a prior weighs less, the more data there are. The same for the observation map's distance
-            from the identity.
+        anchor: Weight of the squared distance of the dynamics' parameters from the pretrained ones, and of the
+            observation map's from the identity.
+        anchor_decay: With r rollouts this weight is r^-anchor_decay of that: 1 where data are independent and the model
+            could be exact, so that a prior weighs less, the more there are; less where the same few places are seen
+            again and again.
         residual: Train a correction that starts at zero on top of frozen pretrained dynamics.
         command_map: Also learn what the machine makes of a command, a few numbers that hold everywhere.
         command_band: With a command map, learn a second one beside it that also has a dead band: how small a command of
@@ -71,6 +75,7 @@ class SGFT(AbstractMethod):
         entropy_coef: float,
         rho: float,
         anchor: float,
+        anchor_decay: float,
         residual: bool,
         command_map: bool,
         command_band: bool,
@@ -96,7 +101,7 @@ class SGFT(AbstractMethod):
         if not 0 <= suspicion_margin < 1:
             raise ValueError(f"suspicion_margin={suspicion_margin} must lie in [0, 1).")
         self.horizon, self.lr, self.policy_lr, self.command_lr = horizon, lr, policy_lr, command_lr
-        self.entropy_coef, self.rho, self.anchor = entropy_coef, rho, anchor
+        self.entropy_coef, self.rho, self.anchor, self.anchor_decay = entropy_coef, rho, anchor, anchor_decay
         self.residual, self.command_map, self.command_band = residual, command_map, command_map and command_band
         self.command_sparsity = command_sparsity
         self.gate = Gate(gate_margin, gate_memory, gate_excess) if gate else None
@@ -159,7 +164,7 @@ class SGFT(AbstractMethod):
             agent,
             to_slices(batch, agent.device),
             rho=self.rho,
-            penalty=Penalty("anchor_distance", self.anchor / rollouts, distance) if self.anchor else None,
+            penalty=Penalty("anchor_distance", self._anchor(starts), distance) if self.anchor else None,
             maps=self._maps(agent.model, starts),
         )
         metrics |= agent.climb(encoded[0], horizon=self.horizon, entropy_coef=self.entropy_coef)
@@ -187,11 +192,11 @@ class SGFT(AbstractMethod):
             return Maps(parts, acting, penalties, rival)
         simulated = self._sensed.starts.to(starts.device)
         box = simulated.amin(0), simulated.amax(0)
-        sensors.doubt(starts, *box)
+        sensors.doubt(starts, *box, DOUBT)
 
         def doubt() -> Tensor:
             far = sensors.outside(starts, *box, suspected=False)
-            return self.start_weight * far + self.anchor / len(starts) * sensors.size()
+            return self.start_weight * far + self._anchor(starts) * sensors.size()
 
         suspicion = self._suspicion(sensors, starts, box) if self.suspicion_margin else None
         return Maps(parts, acting, (*penalties, Penalty("sensor_doubt", 1.0, doubt)), rival, suspicion)
@@ -213,6 +218,9 @@ class SGFT(AbstractMethod):
         )
         parameters = (sensors.shift, *([] if command is None else command.parameters()))
         return Suspicion(parameters, self._joint, penalties)
+
+    def _anchor(self, starts: Tensor) -> float:
+        return self.anchor * len(starts) ** -self.anchor_decay
 
     def _sparse(self, starts: Tensor) -> float:
         return self.command_sparsity / len(starts)

@@ -38,6 +38,7 @@ OURS |= dict(
     observation_map=False,
     observation_lr=5e-3,
     suspicion_margin=0.0,
+    anchor_decay=1.0,
     start_weight=1.0,
     lr_decay=0.0,
     average_decay=0.0,
@@ -53,14 +54,14 @@ TDMPC2_NUMBERS = dict(
 TDMPC2_NUMBERS |= dict(updates=1, **SHARED, **NO_GATE)
 
 
-def hand_over(agent: Agent, name: str = "sgft", **changes):
-    """Give an agent to a method; returns its update of a batch."""
+def hand_over(agent: Agent, name: str = "sgft", rollouts: int = 1, **changes):
+    """Give an agent to a method; returns its update of a batch, after so many rollouts."""
     if name == "sgft":
         method = SGFT(**(SGFT_NUMBERS | changes))
     else:
         method = TDMPC2(**(TDMPC2_NUMBERS | changes)) if name == "tdmpc2" else ZeroShot(**SHARED)
     method.take_over(agent, SENSED)
-    return lambda batch: method.update(agent, batch, starts=torch.zeros(1, agent.model.obs_dim))
+    return lambda batch: method.update(agent, batch, starts=torch.zeros(rollouts, agent.model.obs_dim))
 
 
 def make_agent(sizes=None, **changes) -> Agent:

@@ -81,6 +81,19 @@ def test_anchor_keeps_the_dynamics_near_the_pretrained_ones():
     assert distance(1.0) < 0.2 * distance(0.0)
 
 
+@pytest.mark.parametrize(("decay", "alone"), [(0.0, 1.0), (0.5, 0.25), (1.0, 0.0625)])
+def test_the_anchor_fades_with_the_rollouts_as_told(decay: float, alone: float):
+    """With sixteen rollouts it weighs what a lighter one weighs with a single rollout."""
+    after = []
+    for anchor, rollouts in ((0.5, 16), (0.5 * alone, 1)):
+        agent = pretrained()
+        update = hand_over(agent, lr=3e-3, anchor=anchor, anchor_decay=decay, rollouts=rollouts)
+        for i in range(3):
+            update(make_batch(i))
+        after.append(parts(agent)["dynamics"])
+    assert all(torch.equal(x, after[1][name]) for name, x in after[0].items())
+
+
 def test_snapshot_and_restore_undo_updates_and_go_on_alike():
     agent = pretrained()
     update = hand_over(agent)
