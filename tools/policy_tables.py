@@ -118,10 +118,10 @@ def outside() -> str:
     def way(row: Row) -> str:
         return f"`{row['gap']}`, {'one map, with a dead band' if row['variant'] else 'one map, without'}"
 
-    today = curves(read("outside/deadband.csv"), method_in_gap, "gap and method")
+    today = curves([*read("outside/deadband.csv"), *read("outside/offset.csv")], method_in_gap, "gap and method")
     earlier = curves(read("outside/band.csv"), way, "gap, command map")
     first = curves(read("outside/sgft.csv"), method_in_gap, "gap and method")
-    return f"{first}\n\nWith a second command map:\n\n{today}\n\nWhat led there:\n\n{earlier}"
+    return f"{first}\n\nWith today's settings:\n\n{today}\n\nWhat led there:\n\n{earlier}"
 
 
 def audit() -> str:

@@ -30,9 +30,7 @@ from mpc_sgft.learning.method import AbstractMethod, Gate
 from mpc_sgft.learning.observation_map import Sensed
 from mpc_sgft.learning.world_model import WorldModel
 
-WITHOUT_GATE = Gate(
-    margin=1.0, memory=5
-)  # which command map acts is told without one too: the one that predicts better
+WITHOUT_GATE = Gate(margin=1.0, memory=5)  # without one the command map acts that predicts better
 SIMULATED = 32  # episodes that tell how well the pretrained dynamics predict what they were made for
 SHARED = "observation", "action", "episode", "step", *(("next", k) for k in ("observation", "reward", "terminated"))
 
