@@ -33,7 +33,7 @@ class ObservationMap(nn.Module):
 
     Only doubted entries are corrected, and points are turned only if an entry of one is. Doubt comes from where
     episodes start: nothing has moved yet, so if it looks odd there, no dynamics can be to blame. Without that a map
-    explains whatever the dynamics do otherwise than in simulation, and moves a nail that only sits harder. A puck that
+    explains whatever the dynamics do otherwise than in simulation, and moves a nail that only sits harder. A thing that
     is seen beside its place may still start where others do; what moves it tells then. So the other entries have shifts
     too, which correct nothing until `suspects` says that they do: only those that are not small.
 

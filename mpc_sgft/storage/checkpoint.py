@@ -126,6 +126,7 @@ def load(
             model.add_command_band()
         if meta.get("observation_map") is not None:
             model.add_observation_map(meta["observation_map"])
+            tensors.setdefault("observation_map.suspects", torch.tensor(False))  # the first ones suspected nothing
         if meta.get("suspicion"):
             model.add_suspicion()
         model.load_state_dict(tensors)

@@ -63,6 +63,20 @@ def test_a_header_of_before_keeps_the_temperature_of_before(tmp_path):
     assert 0.1 * checkpoint.load(tmp_path / "old.safetensors").model.value_range == 2.0
 
 
+def test_an_observation_map_of_before_suspects_nothing(tmp_path):
+    model = WorldModel(**SIZES)
+    model.add_observation_map([[0, 1]])
+    model.observation_map.doubted.fill_(1.0)
+    torch.nn.init.normal_(model.observation_map.shift)
+    header = checkpoint.describe(CFG, model)
+    seen = torch.randn(3, 6)
+    wanted = model.encode(seen)
+    del header["suspicion"], model.observation_map._buffers["suspects"]
+    checkpoint.save(tmp_path / "old.safetensors", model, header)
+    loaded = checkpoint.load(tmp_path / "old.safetensors").model
+    assert not loaded.observation_map.suspects and torch.equal(loaded.encode(seen), wanted)
+
+
 def test_a_run_folder_stands_for_the_file_inside(tmp_path):
     saved(tmp_path / checkpoint.WEIGHTS)
     assert checkpoint.load(tmp_path).meta["task"] == "push"
