@@ -52,7 +52,7 @@ def tasks() -> str:
     kept = [{**row, "task": name} for name in ("hammer", "insert") for row in read(f"tasks/{name}_mild.csv")]
     parts.append(f"In `mild`, where there is nothing to gain:\n\n{curves(kept, lambda row: row['task'], 'task')}")
     today = curves(read("tasks/mild.csv"), lambda row: row["task"], "task")
-    parts.append(f"By today's settings:\n\n{today}")
+    parts.append(f"With two command maps:\n\n{today}")
     walked: dict[str, str | tuple[str, Callable[[str], str]]]
     walked = {"gap": "gap", "method": "method", "seed": "seed", "rollouts": "rollouts"}
     walked |= {"return": ("return", digits), "success": ("success", percent)}
@@ -121,7 +121,7 @@ def outside() -> str:
     today = curves([*read("outside/deadband.csv"), *read("outside/offset.csv")], method_in_gap, "gap and method")
     earlier = curves(read("outside/band.csv"), way, "gap, command map")
     first = curves(read("outside/sgft.csv"), method_in_gap, "gap and method")
-    return f"{first}\n\nWith today's settings:\n\n{today}\n\nWhat led there:\n\n{earlier}"
+    return f"{first}\n\nWith two command maps, `offset` with suspicions too:\n\n{today}\n\nWhat led there:\n\n{earlier}"
 
 
 def audit() -> str:

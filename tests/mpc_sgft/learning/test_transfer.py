@@ -159,7 +159,7 @@ def test_a_dead_band_acts_once_it_tells_unseen_rollouts_better(gate: bool, acts:
     steps = rollout(t.pretrained)
     t.verdicts = [Verdict(1.0, 1.0, False), Verdict(1.0, 1.0, True, mapped=1.0, band=Choice(1.0, share, acts))]
     for model in (t.agent.model, t.averaged.model):
-        model.dynamics.band_acts.fill_(acts)
+        model.use_band(acts)
     metrics = t.learn(steps)
     wanted = share < (0.8 if gate and not acts else 1.0)
     assert t.verdicts[-1].band.rival_acts is wanted and metrics["band_acts"] == wanted
