@@ -54,6 +54,14 @@ class QuickModel(Model, Protocol):
         ...
 
 
+class NeutralModel(Model, Protocol):
+    """A model of a machine that zero commands may move."""
+
+    def neutral_action(self) -> Tensor | None:
+        """The action in [-1, 1], [A], that the machine turns into what the simulator makes of zero; None: zero."""
+        ...
+
+
 class RecurrentModel(Model, Protocol):
     """A model that also has a policy with a memory.
 
@@ -81,7 +89,7 @@ class Plan(NamedTuple):
 
     action: Tensor  # what to execute now, [-1, 1]                            [B, A]
     mean: Tensor  # the plan                                                  [B, H, A]
-    std: Tensor  # how sure it is of every entry                              [B, H, A]
+    std: Tensor  # how sure it is of every entry, as the search drew it       [B, H, A]
     value: Tensor  # h_step_return of `mean`, reward units                    [B]
     candidates: Tensor | None = None  # last pool, with keep_candidates       [B, N, H, A]
     candidate_values: Tensor | None = None  # their h_step_return             [B, N]

@@ -22,6 +22,7 @@ from planners.base import (
     plan_values,
 )
 from planners.cuda_graph import CudaGraphs, addresses
+from planners.neutral import from_neutral, neutral_action, to_neutral
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,6 +34,7 @@ class SamplingPlanner(ABC):
 
         mean = Σ_k w_k a_k        std = sqrt(Σ_k w_k (a_k - mean)²), clamped to [min_std, max_std]
 
+    With `neutral` all of this is in coordinates whose zero is the model's neutral action (planners/neutral.py).
     configs/planner/<name>.yaml says what every number does.
 
     Raises:
@@ -50,6 +52,7 @@ class SamplingPlanner(ABC):
     iterations: int = 6
     min_std: float = 0.05
     max_std: float = 2.0
+    neutral: bool = True
     discount: float = 0.99
     chunk_rows: int = 1024
     precision: str = "auto"
@@ -99,7 +102,8 @@ class SamplingPlanner(ABC):
         Args:
             model: What to imagine with, on the device of z.
             z: Latent of every environment, [B, D].
-            previous: The last plan, whose mean, shifted by one step, is where the search starts; None starts at zero.
+            previous: The last plan, whose mean, shifted by one step, is where the search starts; None starts at zero,
+                or at the neutral action.
             fresh: True where an episode just started and `previous` is forgotten, bool [B]; None for nowhere.
             generator: Source of all randomness, on the device of z.
             keep_candidates: Also return the last pool of candidates and their values.
@@ -110,18 +114,30 @@ class SamplingPlanner(ABC):
                 which, and in which environments.
             ValueError: If `previous` belongs to other sizes.
         """
-        mean = self._warm_start(z, previous, fresh)  # [B, H, A]
+        neutral = neutral_action(model) if self.neutral else None
+        mean = self._warm_start(z, previous, fresh, neutral)  # [B, H, A]
+        inputs = [z, mean] if neutral is None else [z, mean, neutral]
         if self.cuda_graph and z.is_cuda and isinstance(model, nn.Module):  # whose tensors can be found
-            plan, names, finite = self._replayed(model, generator, z, mean, keep_candidates, explore)
+            plan, names, finite = self._replayed(model, generator, inputs, keep_candidates, explore)
         else:
-            plan, names, finite = self._search(model, keep_candidates, explore, generator, z, mean)
+            plan, names, finite = self._search(model, keep_candidates, explore, generator, *inputs)
         check_finite(type(self).__name__, names, finite)
         return plan
 
     def _search(
-        self, model: Model, keep_candidates: bool, explore: bool, generator: torch.Generator, z: Tensor, mean: Tensor
+        self,
+        model: Model,
+        keep_candidates: bool,
+        explore: bool,
+        generator: torch.Generator,
+        z: Tensor,
+        mean: Tensor,
+        neutral: Tensor | None = None,
     ) -> tuple[Plan, list[str], Tensor]:
-        """Search around `mean` [B, H, A]: the plan, and what was looked at on the way, as `check_finite` takes it."""
+        """Search around `mean` [B, H, A]: the plan, and what was looked at on the way, as `check_finite` takes it.
+
+        `mean` and all that is drawn are as `planners.neutral.to_neutral` has them.
+        """
         checks, prior = FiniteChecks(), self.num_prior
         checks.note("latents", z)
         std = torch.full_like(mean, self.max_std)
@@ -130,43 +146,45 @@ class SamplingPlanner(ABC):
         if prior:
             noise = torch.randn(pool[:, :prior].shape, generator=generator, device=z.device, dtype=z.dtype)
             start = z.unsqueeze(1).expand(-1, prior, -1)
-            latents, pool[:, :prior] = imagine_policy(model, start, noise, self.horizon)
-            checks.note_followed(latents, pool[:, :prior])
-            values[:, :prior] = imagined_return(model, latents, pool[:, :prior], self.discount)
+            latents, actions = imagine_policy(model, start, noise, self.horizon)
+            checks.note_followed(latents, actions)
+            pool[:, :prior] = to_neutral(actions, neutral)
+            values[:, :prior] = imagined_return(model, latents, actions, self.discount)
 
         returns = plan_values(model, z, self.discount, self.precision, self.chunk_rows)
         for count in self.counts():
             pool, values = pool[:, :count], values[:, :count]
             noise = torch.empty_like(pool[:, prior:]).normal_(generator=generator)
             pool[:, prior:] = torch.addcmul(mean.unsqueeze(1), std.unsqueeze(1), noise).clamp_(-1, 1)
-            values[:, prior:] = returns(pool[:, prior:])
+            values[:, prior:] = returns(from_neutral(pool[:, prior:], neutral))
             checks.note("candidate values", values)
             mean, std = self.refit(pool, values / model.value_range)
-        checks.note("planned actions", mean)
-        value = h_step_return(model, z, mean.unsqueeze(1), self.discount).squeeze(1)
+        plan = from_neutral(mean, neutral)
+        checks.note("planned actions", plan)
+        value = h_step_return(model, z, plan.unsqueeze(1), self.discount).squeeze(1)
         checks.note("values of the plan", value)
-        action = mean[:, 0]
+        action = plan[:, 0]
         if explore:
             draw = torch.randn(action.shape, generator=generator, device=z.device, dtype=z.dtype)
-            action = (action + std[:, 0] * draw).clamp(-1, 1)
-        kept = (pool, values) if keep_candidates else (None, None)
-        return Plan(action, mean, std, value, *kept), checks.names, checks.stacked()
+            action = from_neutral((mean[:, 0] + std[:, 0] * draw).clamp(-1, 1), neutral)
+        kept = (from_neutral(pool, neutral), values) if keep_candidates else (None, None)
+        return Plan(action, plan, std, value, *kept), checks.names, checks.stacked()
 
     def _replayed(
         self,
         model: Model,
         generator: torch.Generator,
-        z: Tensor,
-        mean: Tensor,
+        inputs: list[Tensor],
         keep_candidates: bool,
         explore: bool,
     ) -> tuple[Plan, list[str], Tensor]:
         """`_search` as one CUDA graph for each model, as long as its tensors stay where they are."""
         assert isinstance(model, nn.Module)
         graphs = self._graphs.setdefault(model, CudaGraphs())
-        key = (z.shape, keep_candidates, explore, model.value_range, model.training, addresses(model))
+        shapes = tuple(x.shape for x in inputs)
+        key = (shapes, keep_candidates, explore, model.value_range, model.training, addresses(model))
         search = partial(self._search, model, keep_candidates, explore)
-        plan, names, finite = graphs(key, search, (z, mean), generator)
+        plan, names, finite = graphs(key, search, inputs, generator)
         copies = {name: x.clone() for name, x in plan._asdict().items() if x is not None}
         return Plan(**copies), names, finite
 
@@ -183,8 +201,8 @@ class SamplingPlanner(ABC):
         variance = (weight * (best - mean.unsqueeze(1)).square()).sum(1)
         return mean, variance.sqrt().clamp(self.min_std, self.max_std)
 
-    def _warm_start(self, z: Tensor, previous: Plan | None, fresh: Tensor | None) -> Tensor:
-        """The previous mean one step on, zero where an episode just started, [B, H, A]."""
+    def _warm_start(self, z: Tensor, previous: Plan | None, fresh: Tensor | None, neutral: Tensor | None) -> Tensor:
+        """The previous mean one step on, zero where an episode just started, [B, H, A], as `to_neutral` has it."""
         mean = z.new_zeros(len(z), self.horizon, self.action_dim)
         if previous is None:
             return mean
@@ -193,5 +211,5 @@ class SamplingPlanner(ABC):
                 f"The previous plan is {tuple(previous.mean.shape)}, this one {tuple(mean.shape)} (environments, "
                 "horizon, action entries): start with previous=None where one of them changes."
             )
-        mean[:, :-1] = previous.mean[:, 1:]
+        mean[:, :-1] = to_neutral(previous.mean[:, 1:], neutral)
         return mean if fresh is None else mean.masked_fill_(fresh.view(-1, 1, 1), 0)

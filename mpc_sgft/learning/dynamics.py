@@ -1,5 +1,7 @@
 """Latent dynamics, and what the machine makes of its commands."""
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor, nn
 
@@ -28,6 +30,12 @@ class CommandMap(nn.Linear):
     def forward(self, input: Tensor) -> Tensor:
         c = super().forward(input)
         return c if self.band is None else torch.where(c.abs() > self.band, c - self.band * c.sign(), 0.0)
+
+    def neutral(self) -> Tensor:
+        """The command [A] in [-1, 1] of which, before and now, W u + b is zero, as `Dynamics.neutral_action` has it."""
+        held = self.weight.unflatten(-1, (-1, self.out_features)).sum(-2)  # of the same command at all times [A, A]
+        found, failed = torch.linalg.solve_ex(held, -self.bias)
+        return torch.where(failed == 0, found, 0.0).clamp(-1, 1)
 
     def change(self) -> Tensor:
         """Sum of the absolute differences of all numbers from those it started with, scalar."""
@@ -79,18 +87,27 @@ class Dynamics(nn.Module):
         lag = torch.arange(each.shape[-2], device=commands.device)
         longest = self.command.in_features // self.command.out_features
         window = (lag[:, None] + torch.arange(longest, device=commands.device)).clamp(max=len(lag) - 1)
-        return self._made(self.command, each[..., window, :].flatten(-2)).flatten(-2)
+        told = each[..., window, :].flatten(-2)
+        return self._by_the_map_that_acts(lambda command: command(told)).flatten(-2)
 
-    def _made(self, command: CommandMap, told: Tensor) -> Tensor:
-        """What the map that acts makes of commands [..., K]; on a GPU of both, so that recorded graphs follow it."""
+    def neutral_action(self) -> Tensor | None:
+        """The command [A] that the machine makes nothing of if it is given again and again; None: no command map.
+
+        Nearest to it within [-1, 1], entry by entry; zero where the map that acts has no inverse.
+        """
+        return None if self.command is None else self._by_the_map_that_acts(CommandMap.neutral)
+
+    def _by_the_map_that_acts(self, of: Callable[[CommandMap], Tensor]) -> Tensor:
+        """What the map that acts gives; on a GPU all are asked, so that recorded graphs follow the choice."""
+        assert self.command is not None
         rivals = [(x, self.band_acts) for x in (self.banded,) if x is not None]  # the later ones come first
         rivals += [(x, self.joint_acts) for x in (self.joint,) if x is not None]
-        if not told.is_cuda:
-            return next((rival for rival, acts in reversed(rivals) if acts), command)(told)
-        made = command(told)
+        if not self.command.bias.is_cuda:
+            return of(next((rival for rival, acts in reversed(rivals) if acts), self.command))
+        found = of(self.command)
         for rival, acts in rivals:
-            made = torch.where(acts, rival(told), made)
-        return made
+            found = torch.where(acts, of(rival), found)
+        return found
 
     def command_maps(self) -> list[CommandMap]:
         """All there are."""

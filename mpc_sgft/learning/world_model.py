@@ -158,6 +158,10 @@ class WorldModel(nn.Module):
         mean, log_std = self._policy_moments(z)
         return torch.tanh(mean if noise is None else mean + log_std.exp() * noise)
 
+    def neutral_action(self) -> Tensor | None:
+        """The command that the machine makes nothing of, [A]; None without a command map. See `Dynamics`."""
+        return self.dynamics.neutral_action()
+
     def recurrent_action(
         self, z: Tensor, memory: Tensor | None, begins: Tensor, noise: Tensor | None
     ) -> tuple[Tensor, Tensor]:

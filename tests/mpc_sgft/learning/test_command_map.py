@@ -268,3 +268,36 @@ def test_tdmpc2_may_be_given_a_command_map(mapped: bool) -> None:
     assert (errors[-1] < 0.1 * errors[0]) == mapped
     if mapped:
         assert (agent.model.dynamics.command.weight[:, :A] - TRUTH).abs().max() < 0.05
+
+
+def test_the_neutral_action_is_made_nothing_of() -> None:
+    torch.manual_seed(0)
+    dynamics = Dynamics(16, 2 * A, A, 16, 8)
+    assert dynamics.neutral_action() is None
+    dynamics.command = command = CommandMap(3 * A, A).requires_grad_(False)
+    assert torch.equal(dynamics.neutral_action(), torch.zeros(A))
+    command.weight[:] = torch.cat([TRUTH, 0.5 * TRUTH, 0.1 * torch.eye(A)], 1)  # it comes late, too
+    command.bias[:] = torch.tensor([0.2, -0.3])
+    neutral = dynamics.neutral_action()
+    assert 0.3 < neutral.abs().max() < 1
+    torch.testing.assert_close(dynamics.realised(neutral.repeat(3))[:A], torch.zeros(A))
+    command.bias[:] = 5.0
+    assert dynamics.neutral_action().abs().max() == 1, "the limit nearest to it"
+    command.weight[:] = 0.0
+    assert torch.equal(dynamics.neutral_action(), torch.zeros(A)), "no command is"
+
+
+def test_the_neutral_action_is_of_the_map_that_acts() -> None:
+    model = make_agent(sizes={"obs_dim": 6 + 2 * A, "memory_dim": 2 * A}).model
+    assert model.neutral_action() is None
+    maps = [model.add_command_map(), model.add_command_band()]
+    model.add_observation_map([])
+    model.add_suspicion()
+    for x, shift in zip([*maps, model.dynamics.joint], (0.1, 0.2, 0.3), strict=True):
+        x.bias.data.fill_(shift)
+    found = [model.neutral_action()]
+    model.use_band(True)
+    found.append(model.neutral_action())
+    model.suspect(True)
+    found.append(model.neutral_action())
+    torch.testing.assert_close(torch.stack(found), torch.tensor([[-0.1] * A, [-0.2] * A, [-0.3] * A]))
