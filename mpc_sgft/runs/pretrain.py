@@ -1,6 +1,7 @@
 """The pretraining loop: collect a round of randomised episodes, learn from the buffer, measure, save."""
 
 import json
+import os
 import resource
 import signal
 import sys
@@ -133,7 +134,7 @@ def pretrain(cfg: DictConfig) -> int:
     bar.close()
     final_judge = build.make_env(cfg, cfg.final_episodes, randomised=True)
     planner = build.make_planner(cfg, judge.action_dim)
-    torch.set_num_threads(max(cfg.torch_threads, cores()))  # nothing else works now
+    torch.set_num_threads(max(cfg.torch_threads, free_threads()))  # nothing else works now
     policies = [prior(agent)]
     if cfg.chosen.planner != "policy":
         policies.append(planner_policy(agent.averaged, planner, cfg.seed))
@@ -197,6 +198,12 @@ def start_agent(cfg: DictConfig, env: ControlEnv) -> Agent:
 def prior(agent: Agent) -> Act:
     """The mean action of the averaged policy prior."""
     return planner_policy(agent.averaged, PolicyPlanner(action_dim=agent.model.action_dim, horizon=1), 0)
+
+
+def free_threads() -> int:
+    """Threads for what has the machine to itself: one a core, or as many as OMP_NUM_THREADS allows."""
+    allowed = os.environ.get("OMP_NUM_THREADS", "")
+    return min(cores(), int(allowed)) if allowed.isdecimal() and int(allowed) else cores()
 
 
 def peak_memory_mb() -> dict[str, int]:

@@ -1,6 +1,8 @@
 """The three commands as real processes, on the pendulum with tiny networks."""
 
+import contextlib
 import csv
+import io
 import json
 import os
 import signal
@@ -14,7 +16,7 @@ import torch
 from omegaconf import OmegaConf
 from safetensors.torch import load_file
 
-from mpc_sgft import deploy, pretrain
+from mpc_sgft import deploy, evaluate, pretrain
 from mpc_sgft.command.errors import UserError
 from mpc_sgft.storage import checkpoint
 from mpc_sgft.storage.episode_file import read_episode
@@ -23,6 +25,7 @@ from tools.studies import relearn
 TINY = ["+experiment=debug", "task=pendulum", "log.tensorboard=false", "log.rerun=false"]
 NEEDED = "task gap method seed real_rollouts aborted_rollouts zero_shot_success final_success rollouts_to_90".split()
 NEEDED += ["wall_seconds", "rrd"]
+pytestmark = pytest.mark.xdist_group("loops")  # all in one worker: what they share takes a minute to make
 
 
 def command(name: str, *words: str) -> list[str]:
@@ -33,6 +36,14 @@ def command(name: str, *words: str) -> list[str]:
 def run(name: str, *words: str) -> subprocess.CompletedProcess:
     environment = os.environ | {"OMP_NUM_THREADS": "1"}
     return subprocess.run(command(name, *words), capture_output=True, text=True, timeout=240, env=environment)
+
+
+def here(name: str, *words: str) -> subprocess.CompletedProcess:
+    """As `run`, in this process: spares the start where a process of its own tells nothing more."""
+    out, err, argv = io.StringIO(), io.StringIO(), command(name, *words)[3:]
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        code = {"pretrain": pretrain, "deploy": deploy, "evaluate": evaluate}[name].main(argv)
+    return subprocess.CompletedProcess(argv, code, out.getvalue(), err.getvalue())
 
 
 def rows(folder: Path) -> list[dict]:
@@ -85,9 +96,9 @@ def test_widening_randomisation_resumes_with_the_same_numbers(tmp_path):
     words = "curriculum=doraemon", "curriculum.episodes=6", "curriculum.success=0.01", "collector=inline"
     whole, half = tmp_path / "whole", tmp_path / "half"
     for folder, much in ((whole, 1920), (half, 960)):
-        done = run("pretrain", f"run_dir={folder}", f"transitions={much}", *words)
+        done = here("pretrain", f"run_dir={folder}", f"transitions={much}", *words)
         assert done.returncode == 0, done.stderr
-    assert run("pretrain", "--resume", str(half), "transitions=1920").returncode == 0
+    assert here("pretrain", "--resume", str(half), "transitions=1920").returncode == 0
     ours, theirs = ([float(r["randomize_entropy"]) for r in rows(folder)] for folder in (whole, half))
     assert ours == theirs
     drawn = [json.loads((folder / "summary.json").read_text())["randomize"] for folder in (whole, half)]
@@ -96,13 +107,13 @@ def test_widening_randomisation_resumes_with_the_same_numbers(tmp_path):
 
 def test_a_policy_with_a_memory_goes_on_after_a_stop_and_is_deployed_as_it_is(pretrained, tmp_path, capsys):
     words, whole = ["train=recurrent_dr", "train.agent.memory_dim=8", "collector=inline"], tmp_path / "whole"
-    done = run("pretrain", f"run_dir={whole}", "transitions=640", f"checkpoint={pretrained}", *words)
+    done = here("pretrain", f"run_dir={whole}", "transitions=640", f"checkpoint={pretrained}", *words)
     assert done.returncode == 0, done.stderr
-    assert run("pretrain", "--resume", str(whole), "transitions=1280").returncode == 0
+    assert here("pretrain", "--resume", str(whole), "transitions=1280").returncode == 0
     assert [r["updates"] for r in rows(whole)][-1] == "64" and float(rows(whole)[-1]["q_loss"]) > 0
     found = checkpoint.load(whole / "checkpoint" / "model.safetensors").model
     given = [f"checkpoint={whole}", f"run_dir={tmp_path / 'd'}", "rollouts=1"]
-    assert run("deploy", *given, "method=zero_shot", "planner=policy").returncode == 0
+    assert here("deploy", *given, "method=zero_shot", "planner=policy").returncode == 0
     after = checkpoint.load(tmp_path / "d" / "checkpoint" / "model.safetensors").model
     assert torch.equal(after.recurrent_policy.head[-1].weight, found.recurrent_policy.head[-1].weight)
     frozen, alone = "method=zero_shot", "planner=policy"  # sgft would train what does not act; a search ignores it
@@ -146,7 +157,7 @@ def test_the_summary_holds_what_scripts_read(deployed):
 
 def test_evaluation_episodes_follow_their_own_seed(pretrained, deployed, tmp_path):
     def before(*words: str) -> float:
-        done = run(
+        done = here(
             "deploy", f"checkpoint={pretrained}", "gap=pendulum_torque", "rollouts=1", "method.updates=0", *words
         )
         return json.loads(done.stdout.splitlines()[-1])["return_curve"]["0"]
@@ -165,7 +176,7 @@ def test_deployment_freezes_what_it_must(pretrained, deployed):
 def test_the_simulation_policy_drives_the_warm_up_and_the_planner_the_rest(pretrained, tmp_path):
     folder = tmp_path / "run"
     words = ["gap=pendulum_torque", "rollouts=2", "warmup=1", "method.action_noise=0", "method.updates=0"]
-    done = run("deploy", f"checkpoint={pretrained}", f"run_dir={folder}", *words)
+    done = here("deploy", f"checkpoint={pretrained}", f"run_dir={folder}", *words)
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout.splitlines()[-1])["real_rollouts"] == 2  # a warm-up rollout counts like any other
     model, _ = checkpoint.load(pretrained)
@@ -201,7 +212,7 @@ def test_a_killed_deployment_loses_at_most_the_step_in_flight(pretrained, tmp_pa
 
 
 def test_evaluate_reports_an_interval(pretrained, tmp_path):
-    done = run("evaluate", f"checkpoint={pretrained}", f"run_dir={tmp_path / 'e'}", "episodes=6")
+    done = here("evaluate", f"checkpoint={pretrained}", f"run_dir={tmp_path / 'e'}", "episodes=6")
     assert done.returncode == 0, done.stderr
     result = json.loads(done.stdout.splitlines()[-1])
     low, high = result["success_interval"]
@@ -209,7 +220,7 @@ def test_evaluate_reports_an_interval(pretrained, tmp_path):
 
 
 def test_the_scripted_pendulum_swings_up(tmp_path):
-    done = run("evaluate", "policy=scripted", f"run_dir={tmp_path / 'e'}", "episodes=40", "quiet=false")
+    done = here("evaluate", "policy=scripted", f"run_dir={tmp_path / 'e'}", "episodes=40", "quiet=false")
     assert "evaluate: 100%" in done.stderr
     assert json.loads(done.stdout.splitlines()[-1])["success"] >= 0.95
 

@@ -8,7 +8,7 @@ from omegaconf import OmegaConf
 from mpc_sgft.command import compose
 from mpc_sgft.command.errors import UserError
 from mpc_sgft.learning.world_model import WorldModel
-from mpc_sgft.runs import build
+from mpc_sgft.runs import build, pretrain
 from mpc_sgft.runs.collectors import Inline, Process
 from mpc_sgft.runs.explore import Collected, Round, explorer, policy_weights, share
 from mpc_sgft.runs.pretrain import start_agent
@@ -160,3 +160,12 @@ def test_a_collecting_process_that_dies_is_named():
 def test_more_workers_than_environments_are_refused():
     with pytest.raises(UserError, match="collector.workers=3: between 1 and num_envs=2"):
         Process(config(num_envs=2), SIZES, workers=3)
+
+
+@pytest.mark.parametrize(("given", "threads"), [(None, 8), ("", 8), ("0", 8), ("3", 3), ("20", 8), ("4,2", 8)], ids=str)
+def test_the_final_evaluation_takes_the_cores_that_it_is_allowed(monkeypatch, given, threads):
+    monkeypatch.setattr(pretrain, "cores", lambda: 8)
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    if given is not None:
+        monkeypatch.setenv("OMP_NUM_THREADS", given)
+    assert pretrain.free_threads() == threads
