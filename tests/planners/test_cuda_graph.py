@@ -26,7 +26,8 @@ def z() -> Tensor:
 def test_a_search_asks_the_device_for_nothing(random_model, z: Tensor, kind) -> None:
     planner, mean = kind(**NUMBERS), torch.zeros(5, 4, 2)
     with torch.no_grad(), NoWaiting():
-        planner._search(random_model(), True, True, torch.Generator().manual_seed(0), z, mean)
+        for neutral in (None, torch.tensor([0.5, -0.25])):
+            planner._search(random_model(), True, True, torch.Generator().manual_seed(0), z, mean, neutral)
     with torch.no_grad(), NoWaiting(), pytest.raises(AssertionError, match="the host waits"):
         bool(z.sum() > 0)
 
@@ -42,9 +43,12 @@ def plans(planner, model, z: Tensor, count: int) -> tuple[list[Plan], Tensor]:
 
 
 @pytest.mark.gpu
+@pytest.mark.parametrize("neutral", [None, [0.5, -0.25]])
 @pytest.mark.parametrize("kind", SEARCHES)
-def test_replayed_plans_are_those_that_are_not(random_model, z: Tensor, kind) -> None:
+def test_replayed_plans_are_those_that_are_not(random_model, z: Tensor, kind, neutral: list[float] | None) -> None:
     model, z = random_model().cuda(), z.cuda()
+    if neutral:
+        model.neutral_action = lambda: torch.tensor(neutral, device="cuda")
     graphed, ends = plans(kind(**NUMBERS), model, z, WARM_UP + 4)
     launched, same = plans(kind(cuda_graph=False, **NUMBERS), model, z, WARM_UP + 4)
     for mine, theirs in zip(graphed, launched, strict=True):  # the first ones must not have been overwritten
