@@ -64,6 +64,10 @@ def tasks() -> str:
     return "\n\n".join(parts)
 
 
+def once() -> str:
+    return curves(read("once/once.csv"), method_in_gap, "gap and method")
+
+
 def benchmark() -> str:
     """Who is how good after so many rollouts, in each gap and in all, and who is probably better than whom."""
     rows = read("benchmark/scores.csv")

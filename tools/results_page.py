@@ -34,6 +34,7 @@ STUDIES: dict[str, Callable[[], str]] = {
     "transfer": policy_tables.transfer,
     "outside": policy_tables.outside,
     "tasks": policy_tables.tasks,
+    "once": policy_tables.once,
     "entry": lambda: curves(read("entry/sb3_sac.csv"), lambda r: r["name"], "environment"),
     "audit": policy_tables.audit,
     "ladder": ladder,
@@ -93,6 +94,12 @@ def headline() -> str:
         after = [[float(r["success"]) for r in runs if int(r["rollouts"]) == n] for n in shown]
         text = " → ".join(spread(values).replace(" %", "") for values in after) + " %"
         rows.append([f"`{runs[0]['gap']}`, {' → '.join(map(str, shown))}", text, "tasks"])
+    runs = read("once/once.csv")
+    counts = sorted({int(r["rollouts"]) for r in runs})
+    text = " → ".join(
+        spread([float(r["success"]) for r in runs if int(r["rollouts"]) == n]).replace(" %", "") for n in counts
+    )
+    rows.append([f"five gaps measured once, {' → '.join(map(str, counts))}", f"{text} %", "once"])
     score = {r["score"]: r for r in read("blind/blind.csv") if r["method"] == "diagnose"}
     top, false = score["single, clear: top 1"], score["no effect: false alarms"]
     rows.append(["diagnose, right name", f"{percent(top['value'])} of {top['of']}", "blind"])
