@@ -123,10 +123,7 @@ class Transfer:
         gate, before = self.method.gate or WITHOUT_GATE, self.verdicts[1:]
 
         def choose(
-            set_acting: Callable[[WorldModel, bool], object],
-            choices: list[Choice | None],
-            margin: float,
-            learned: list[float] | None = None,
+            set_acting: Callable[[WorldModel, bool], object], choices: list[Choice | None], margin: float
         ) -> Choice:
             errors = []
             for acts in (False, True):
@@ -134,13 +131,9 @@ class Transfer:
                 errors.append(error(simulator))
             choice = Choice(errors[0], errors[1], False)
             if self.verdicts:
-                seen = [*choices, choice][-gate.memory :]
+                pairs = [(c.rival, c.plain) for c in [*choices, choice] if c][-gate.memory :]
                 acts = bool(choices and choices[-1] and choices[-1].rival_acts)
-                begun = begins([(c.rival, c.plain) for c in seen if c], acts, margin)
-                if begun and not acts and learned:
-                    pairs = zip(seen, learned[-gate.memory :], strict=True)
-                    begun = begins([(c.rival, fine_tuned) for c, fine_tuned in pairs if c], False, 1.0)
-                choice = choice._replace(rival_acts=begun)
+                choice = choice._replace(rival_acts=begins(pairs, acts, margin))
             for model in (simulator, self.agent.model, self.averaged.model):
                 set_acting(model, choice.rival_acts)
             return choice
@@ -149,11 +142,8 @@ class Transfer:
             simulator.suspect(False)  # until it is chosen
         band = choose(WorldModel.use_band, [v.band for v in before], gate.margin) if has_band else None
         mapped = band.plain if band else error(simulator)
-        if not margin:
-            return mapped, band, None
-        # A few numbers of a sensor that lies tell more than all weights that learned to make up for it.
-        learned = [*(v.fine_tuned for v in before), error(self.averaged.model)]
-        return mapped, band, choose(WorldModel.suspect, [v.suspicion for v in before], margin, learned)
+        suspicion = choose(WorldModel.suspect, [v.suspicion for v in before], margin) if margin else None
+        return mapped, band, suspicion
 
     def _error_in_simulation(self) -> float:
         """Of the pretrained dynamics; asked for at the first rollout, when nothing has trained yet."""

@@ -191,21 +191,6 @@ def test_a_suspicion_acts_once_it_tells_unseen_rollouts_much_better(acts: bool, 
     assert not t.pretrained.observation_map.suspects
 
 
-@pytest.mark.parametrize("acts", [True, False])
-@pytest.mark.parametrize(("fine_tuned", "less"), [(0.15, False), (0.25, True)])
-def test_a_suspicion_must_tell_more_than_what_is_fine_tuned(acts: bool, fine_tuned: float, less: bool, monkeypatch):
-    """To begin: in the product over two rollouts, of which each has its 0.45."""
-    numbers = {"command_map": True, "observation_map": True, "suspicion_margin": 0.5}
-    t = transfer(updates=1, margin=0.8, sizes=MEMORY, of_method=numbers)
-    monkeypatch.setattr(
-        "mpc_sgft.learning.transfer.open_loop_error",
-        lambda model, *_: torch.full((2, 2), 0.45 if model.observation_map.suspects else 1.0),
-    )
-    t.verdicts = [Verdict(1.0, 1.0, False), Verdict(1.0, fine_tuned, True, suspicion=Choice(1.0, 0.45, acts))]
-    t.learn(rollout(t.pretrained))
-    assert t.verdicts[-1].suspicion.rival_acts is (acts or less)
-
-
 def test_the_first_rollout_tells_nothing_of_a_suspicion(monkeypatch):
     """Then nothing has been learned, and both are the same but for rounding."""
     t = transfer(updates=1, of_method={"observation_map": True, "suspicion_margin": 0.5})
