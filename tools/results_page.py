@@ -99,7 +99,7 @@ def headline() -> str:
     text = " → ".join(
         spread([float(r["success"]) for r in runs if int(r["rollouts"]) == n]).replace(" %", "") for n in counts
     )
-    rows.append([f"five gaps measured once, {' → '.join(map(str, counts))}", f"{text} %", "once"])
+    rows.append([f"5 measured once, {' → '.join(map(str, counts))}", f"{text} %", "once"])
     score = {r["score"]: r for r in read("blind/blind.csv") if r["method"] == "diagnose"}
     top, false = score["single, clear: top 1"], score["no effect: false alarms"]
     rows.append(["diagnose, right name", f"{percent(top['value'])} of {top['of']}", "blind"])
