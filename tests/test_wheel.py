@@ -14,7 +14,6 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("configs", "envs", "planners", "mpc_sgft")
-pytestmark = pytest.mark.xdist_group("wheel")  # one wheel
 
 
 def run(*line: str | Path, cwd: Path) -> str:

@@ -25,7 +25,6 @@ LENS = {"width": 64, "height": 48, "fx": 60.0, "fy": 60.0, "cx": 31.5, "cy": 23.
 RED, GREEN = 200, 60  # of every picture; its blue is its number
 HAND = 0.1034  # [m] from the flange to between the fingertips, where the robot's own O_T_EE is
 SECONDS = 8  # of film
-pytestmark = pytest.mark.xdist_group("record pairs")  # one stand-in
 
 
 @pytest.fixture(scope="module")

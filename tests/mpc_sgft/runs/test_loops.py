@@ -25,7 +25,6 @@ from tools.studies import relearn
 TINY = ["+experiment=debug", "task=pendulum", "log.tensorboard=false", "log.rerun=false"]
 NEEDED = "task gap method seed real_rollouts aborted_rollouts zero_shot_success final_success rollouts_to_90".split()
 NEEDED += ["wall_seconds", "rrd"]
-pytestmark = pytest.mark.xdist_group("loops")  # all in one worker: what they share takes a minute to make
 
 
 def command(name: str, *words: str) -> list[str]:

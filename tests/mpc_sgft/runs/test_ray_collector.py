@@ -22,7 +22,6 @@ from mpc_sgft.runs.explore import Collected, Explorer, Round, joined, policy_wei
 from mpc_sgft.runs.ray_collector import Ray
 
 pytest.importorskip("ray", reason="needs Ray")
-pytestmark = pytest.mark.xdist_group("ray")  # one cluster
 HEAD = (
     "import ray, sys\n"
     "ray.init(address='local', num_cpus=2, include_dashboard=False, object_store_memory=2**28, log_to_driver=False)\n"
