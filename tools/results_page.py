@@ -7,13 +7,13 @@
 
 import argparse
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from statistics import median
 
 from tools import diagnose_tables, policy_tables, timing_tables
 from tools.ladder_table import ladder
-from tools.tables import RESULTS, ROOT, curves, percent, pick, read, spread, table
+from tools.tables import RESULTS, ROOT, Row, curves, percent, pick, read, spread, table
 
 BEGIN, END = "<!-- headline:begin -->", "<!-- headline:end -->"
 
@@ -75,6 +75,12 @@ def page() -> str:
     return "\n\n".join(study(name) for name in STUDIES)
 
 
+def over_rollouts(runs: list[Row], counts: Sequence[int]) -> str:
+    """Success after each number of rollouts, over all runs."""
+    after = [[float(row["success"]) for row in runs if int(row["rollouts"]) == n] for n in counts]
+    return " → ".join(spread(values).replace(" %", "") for values in after) + " %"
+
+
 def headline() -> str:
     """The table of the README."""
     scratch = [float(row["success"]) for row in read("pretrain/pretrain.csv")]
@@ -82,24 +88,15 @@ def headline() -> str:
     rows = [["push, pretrained", f"{spread(scratch)} in {median(took):.0f} min", "pretrain"]]
     runs = read("transfer/sgft.csv")
     for gap in dict.fromkeys(row["gap"] for row in runs):
-        after = [
-            [float(r["success"]) for r in runs if r["gap"] == gap and r["rollouts"] == n] for n in ("0", "10", "30")
-        ]
-        text = " → ".join(spread(values).replace(" %", "") for values in after) + " %"
+        text = over_rollouts([row for row in runs if row["gap"] == gap], (0, 10, 30))
         rows.append([f"`{gap}`, 0 → 10 → 30 rollouts", text, "transfer"])
     for task in policy_tables.TASKS:
         runs = read(f"tasks/{task}.csv")
         counts = sorted({int(r["rollouts"]) for r in runs})
         shown = [counts[0], counts[len(counts) // 2], counts[-1]]
-        after = [[float(r["success"]) for r in runs if int(r["rollouts"]) == n] for n in shown]
-        text = " → ".join(spread(values).replace(" %", "") for values in after) + " %"
-        rows.append([f"`{runs[0]['gap']}`, {' → '.join(map(str, shown))}", text, "tasks"])
-    runs = read("once/once.csv")
-    counts = sorted({int(r["rollouts"]) for r in runs})
-    text = " → ".join(
-        spread([float(r["success"]) for r in runs if int(r["rollouts"]) == n]).replace(" %", "") for n in counts
-    )
-    rows.append([f"5 measured once, {' → '.join(map(str, counts))}", f"{text} %", "once"])
+        what = f"`{runs[0]['gap']}`, {' → '.join(map(str, shown))}"
+        rows.append([what, over_rollouts(runs, shown), "tasks"])
+    rows.append(["5 measured once, 0 → 10 → 20", over_rollouts(read("once/once.csv"), (0, 10, 20)), "once"])
     score = {r["score"]: r for r in read("blind/blind.csv") if r["method"] == "diagnose"}
     top, false = score["single, clear: top 1"], score["no effect: false alarms"]
     rows.append(["diagnose, right name", f"{percent(top['value'])} of {top['of']}", "blind"])

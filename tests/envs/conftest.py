@@ -101,6 +101,19 @@ def first_and_last(backend: SimBackend, policy: Callable[[np.ndarray], np.ndarra
     return first, seen
 
 
+def told(wanted: np.ndarray, gap: dict[str, Any]) -> np.ndarray:
+    """Commands of which a machine with these effects makes what is wanted, as far as their limits allow, [N, A]."""
+    angle = gap.get("frame_rotation", {"angle": 0.0})["angle"]
+    c, s = np.cos(angle), np.sin(angle)
+    if angle:
+        wanted = wanted @ np.array([[c, -s], [s, c]])
+    if "directional_gain" in gap:
+        wanted = wanted / np.where(wanted > 0, gap["directional_gain"]["positive"], gap["directional_gain"]["negative"])
+    wanted = wanted / gap.get("actuator_gain", {"gain": 1.0})["gain"]
+    wanted = wanted - np.array(gap.get("actuator_offset", {"offset": 0.0})["offset"])
+    return wanted / np.maximum(1, np.abs(wanted).max(1, keepdims=True))
+
+
 @pytest.fixture
 def make_env(make_backend) -> Callable[..., ControlEnv]:
     """make_env(task, num_envs, history=0, **as make_backend): a ControlEnv."""

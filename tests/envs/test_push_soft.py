@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import yaml
 
-from tests.envs.conftest import CONFIGS, first_and_last
+from tests.envs.conftest import CONFIGS, first_and_last, told
 
 TASKS = ["push_towel", "push_ball"]
 SHORT = {"push_towel": 0.0, "push_ball": 0.04}  # [m] before the line, where the ball is let go
@@ -16,14 +16,12 @@ def _gap(name: str) -> dict:
 
 def _who_knows(task, gap: dict):
     """The scripted policy of one who knows the gap, and how far the object goes on by itself."""
-    angle, gain = (gap[e][p] for e, p in (("frame_rotation", "angle"), ("actuator_gain", "gain"))) if gap else (0, 1)
-    c, s = np.cos(-angle), np.sin(-angle)
 
     def act(seen: np.ndarray) -> np.ndarray:
         line, task.goal_x = task.goal_x, task.goal_x - SHORT[task.name]
-        wanted = task.scripted(seen) @ np.array([[c, s], [-s, c]]) / gain
+        wanted = task.scripted(seen)
         task.goal_x = line
-        return wanted / np.maximum(1, np.abs(wanted).max(1, keepdims=True))
+        return told(wanted, gap)
 
     return act
 
