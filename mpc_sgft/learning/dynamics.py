@@ -1,6 +1,6 @@
 """Latent dynamics, and what the machine makes of its commands."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor, nn
@@ -73,8 +73,16 @@ class Dynamics(nn.Module):
         self.code_dim, self.memory_dim, self.simnorm_dim = code_dim, memory_dim, simnorm_dim
 
     def forward(self, z: Tensor, action: Tensor) -> Tensor:
-        commands = torch.cat([action, z[..., self.code_dim :]], -1)  # newest first [..., A + M]
-        x = torch.cat([z[..., : self.code_dim], self.realised(commands)], -1)  # [..., D + A + M]
+        commands = self.commands(z, action)
+        return self.next(z, commands, self.realised(commands))
+
+    def commands(self, z: Tensor, action: Tensor) -> Tensor:
+        """This command and those that the latent remembers, newest first [..., A + M]."""
+        return torch.cat([action, z[..., self.code_dim :]], -1)
+
+    def next(self, z: Tensor, commands: Tensor, realised: Tensor) -> Tensor:
+        """The next latent, given what the machine makes of its commands, both newest first [..., A + M]."""
+        x = torch.cat([z[..., : self.code_dim], realised], -1)  # [..., D + A + M]
         logits = self.base(x)
         code = simnorm(logits if self.residual is None else logits + self.residual(x), self.simnorm_dim)
         return torch.cat([code, commands[..., : self.memory_dim]], -1) if self.memory_dim else code
@@ -118,3 +126,15 @@ class Dynamics(nn.Module):
         if self.command is None or not self.memory_dim:
             return z
         return torch.cat([z[..., : self.code_dim], self.realised(z[..., self.code_dim :])], -1)
+
+
+def side_by_side(parts: Sequence[Dynamics]) -> Callable[[Tensor, Tensor], Tensor]:
+    """Dynamics that differ in their command map alone, each on its share of a batch [K B, ...]: one pass for all."""
+    first = parts[0]
+
+    def forward(z: Tensor, action: Tensor) -> Tensor:
+        commands = first.commands(z, action)
+        shares = zip(parts, commands.chunk(len(parts)), strict=True)
+        return first.next(z, commands, torch.cat([dynamics.realised(share) for dynamics, share in shares]))
+
+    return forward

@@ -1,6 +1,6 @@
 """One step of what learns from real data: the dynamics and the maps of commands and observations, or a whole model."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
@@ -8,9 +8,10 @@ from torch import Tensor, nn
 
 from mpc_sgft.learning import losses
 from mpc_sgft.learning.agent import Agent
-from mpc_sgft.learning.dynamics import Dynamics
+from mpc_sgft.learning.dynamics import Dynamics, side_by_side
 from mpc_sgft.learning.precision import in_own_precision
 from mpc_sgft.learning.slices import Slices, check_finite
+from mpc_sgft.learning.world_model import WorldModel
 
 
 class Penalty(NamedTuple):
@@ -55,6 +56,11 @@ class Maps(NamedTuple):
     rival: Dynamics | None = None
     suspicion: Suspicion | None = None
 
+    def parameters(self) -> list[nn.Parameter]:
+        """All that learn."""
+        own = [p for part in self.parts for p in part.parameters()]
+        return list(dict.fromkeys([*own, *(self.suspicion.parameters if self.suspicion else ())]))
+
 
 @in_own_precision
 def fit_dynamics(
@@ -80,43 +86,57 @@ def fit_dynamics(
     Raises:
         FloatingPointError: If a loss is not finite; nothing has changed then.
     """
-    seen = agent.model.encode(data.observation)  # [T + 1, B, D]
-    encoded = seen.detach()
+    with torch.no_grad():
+        encoded = agent.model.encode(data.observation)  # [T + 1, B, D]
+    metrics = dict[str, Tensor]()
 
-    def error(dynamics: nn.Module, encoded: Tensor) -> Tensor:  # its targets are no constants: the maps move them
-        zs = losses.imagine(dynamics, encoded[0], data.action)
-        return losses.over_time((zs[1:] - encoded[1:]).square().mean(-1), rho)
-
-    def with_penalties(loss: Tensor, penalties: tuple[Penalty, ...]) -> Tensor:
+    def add(name: str, loss: Tensor, penalties: tuple[Penalty, ...]) -> Tensor:
+        metrics[name] = loss
         for penalty in penalties:
             metrics[penalty.name] = penalty.value()
             loss = loss + penalty.weight * metrics[penalty.name]
         return loss
 
-    metrics = {"consistency_loss": error(agent.model.dynamics, encoded)}
-    total = with_penalties(metrics["consistency_loss"], (penalty,) if penalty else ())
-    if maps is not None:
-        trusted = agent.model.encode(data.observation, suspected=False) if maps.suspicion else seen
-        metrics["map_loss"] = error(maps.simulated, trusted)
-        of_maps = with_penalties(metrics["map_loss"], maps.penalties)
-        if maps.rival is not None:
-            metrics["rival_loss"] = error(maps.rival, trusted.detach())
-            of_maps = of_maps + metrics["rival_loss"]
-        if maps.suspicion is not None:
-            suspected = agent.model.encode(data.observation, suspected=True)
-            metrics["suspicion_loss"] = error(maps.suspicion.simulated, suspected)
-            of_suspicion = with_penalties(metrics["suspicion_loss"], maps.suspicion.penalties)
+    (error,) = _errors([agent.model.dynamics], encoded, data.action, rho)
+    total = add("consistency_loss", error, (penalty,) if penalty else ())
+    of_maps = None if maps is None else _explain(agent.model, data, rho, maps, add)
     check_finite(metrics)
     agent.optimizers.model.zero_grad()
     scale = agent.weights["consistency_loss"]
     (scale * total).backward(inputs=agent.dynamics_parameters() if maps else None)
-    if maps is not None:
-        (scale * of_maps).backward(inputs=[p for part in maps.parts for p in part.parameters()])
-        if maps.suspicion is not None:
-            (scale * of_suspicion).backward(inputs=[*maps.suspicion.parameters])
+    if maps is not None and of_maps is not None:
+        (scale * of_maps).backward(inputs=maps.parameters())
     metrics["grad_norm"] = torch.nn.utils.clip_grad_norm_(agent.optimizers.trained, agent.grad_clip, foreach=True)
     agent.optimizers.model.step()
     return metrics, encoded
+
+
+def _explain(
+    model: WorldModel, data: Slices, rho: float, maps: Maps, add: Callable[[str, Tensor, tuple[Penalty, ...]], Tensor]
+) -> Tensor:
+    """Sum of the losses of what maps explain, scalar; all are imagined in one pass."""
+    looks = (False, True) if maps.suspicion else (None,)
+    corrected = torch.stack([model.corrected(data.observation, suspected=look) for look in looks], 1)
+    encoded = model.encode_corrected(corrected).unbind(1)  # each [T + 1, B, D]
+    told = [("map_loss", maps.simulated, encoded[0], maps.penalties)]
+    if maps.rival is not None:
+        told.append(("rival_loss", maps.rival, encoded[0].detach(), ()))
+    if maps.suspicion is not None:
+        told.append(("suspicion_loss", maps.suspicion.simulated, encoded[1], maps.suspicion.penalties))
+    names, dynamics, targets, penalties = zip(*told, strict=True)
+    errors = _errors(dynamics, torch.cat(targets, 1), data.action, rho)
+    return torch.stack([add(*each) for each in zip(names, errors, penalties, strict=True)]).sum()
+
+
+def _errors(dynamics: Sequence[Dynamics], encoded: Tensor, action: Tensor, rho: float) -> list[Tensor]:
+    """Loss of each of K dynamics, scalars, on its share of [T + 1, K B, D], with the same actions [T, B, A] for all.
+
+    What is to be predicted is no constant: the maps move it.
+    """
+    count = len(dynamics)
+    zs = losses.imagine(side_by_side(dynamics), encoded[0], action.repeat(1, count, 1))
+    squared = (zs[1:] - encoded[1:]).square().mean(-1)  # [T, K B]
+    return [losses.over_time(part, rho) for part in squared.chunk(count, 1)]
 
 
 @in_own_precision

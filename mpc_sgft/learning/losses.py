@@ -7,12 +7,12 @@ Source: TD-MPC2, arXiv:2310.16828; entropy coefficient: SAC, arXiv:1812.05905; t
 ICLR 2025).
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
-from torch import Tensor, nn
+from torch import Tensor
 
 from mpc_sgft.learning.layers import by_blocks
 from mpc_sgft.learning.slices import Slices
@@ -31,7 +31,7 @@ def over_time(loss: Tensor, rho: float) -> Tensor:
     return (rho**steps * mean).mean()
 
 
-def imagine(dynamics: nn.Module, z: Tensor, actions: Tensor) -> Tensor:
+def imagine(dynamics: Callable[[Tensor, Tensor], Tensor], z: Tensor, actions: Tensor) -> Tensor:
     """Latents from z [B, D] on, by actions [T, B, A]: [T + 1, B, D]."""
     zs = [z]
     for action in actions:

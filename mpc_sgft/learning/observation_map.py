@@ -75,23 +75,24 @@ class ObservationMap(nn.Module):
 
         Args:
             observation: As seen.
-            suspected: False: as if nothing were suspected. True: in all entries; only those that are not doubted learn
-                by it. None: in those that are corrected now.
+            suspected: False: as if nothing were suspected. True: in all entries; only the shifts of those that are not
+                doubted learn by it. None: in those that are corrected now.
         """
         size, doubted = len(self.unit), self.doubted.bool()
-        shifted = self.shifted
+        shifted, turned = self.shifted, self.turned
         if suspected is not None:
             shift = torch.where(doubted, self.shift.detach(), self.shift) if suspected else self.doubted * self.shift
             shifted = shift * self.unit
+            turned = turned.detach() if suspected else turned
         seen = observation[..., : self.blocks * size].unflatten(-1, (self.blocks, size))
         right = seen + shifted
         if self.points:
             i, j = torch.tensor(self.points, device=seen.device).T
             x, y = (seen - self.centre)[..., i], (seen - self.centre)[..., j]
-            cos, sin = torch.cos(self.turned), torch.sin(self.turned)
-            turned = torch.zeros_like(seen)
-            turned[..., i], turned[..., j] = (cos - 1) * x - sin * y, sin * x + (cos - 1) * y
-            right = right + turned
+            cos, sin = torch.cos(turned), torch.sin(turned)
+            moved = torch.zeros_like(seen)
+            moved[..., i], moved[..., j] = (cos - 1) * x - sin * y, sin * x + (cos - 1) * y
+            right = right + moved
         return torch.cat([right.flatten(-2), observation[..., self.blocks * size :]], -1)
 
     def size(self) -> Tensor:

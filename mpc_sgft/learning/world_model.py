@@ -185,11 +185,19 @@ class WorldModel(nn.Module):
 
     # -- what learning calls -------------------------------------------------------------------------------------------
 
-    def encode(self, observation: Tensor, *, suspected: bool | None = None) -> Tensor:
-        """Latent of a raw observation, [..., O] -> [..., D]; `suspected` as in the observation map."""
+    def encode(self, observation: Tensor) -> Tensor:
+        """Latent of a raw observation, [..., O] -> [..., D]."""
+        return self.encode_corrected(self.corrected(observation))
+
+    def corrected(self, observation: Tensor, *, suspected: bool | None = None) -> Tensor:
+        """What the sensors should have said, [..., O] -> [..., O]; `suspected` as in the observation map."""
+        if self.observation_map is None:
+            return observation
+        return self.observation_map(observation, suspected=suspected)
+
+    def encode_corrected(self, observation: Tensor) -> Tensor:
+        """Latent of what `corrected` gives, [..., O] -> [..., D]."""
         seen = self.obs_dim - self.memory_dim
-        if self.observation_map is not None:
-            observation = self.observation_map(observation, suspected=suspected)
         code = by_blocks(lambda o: self.encoder(self.normalizer(o)[..., :seen]), observation)
         return torch.cat([code, observation[..., seen:]], -1) if self.memory_dim else code
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from mpc_sgft.learning.dynamics import CommandMap, Dynamics
+from mpc_sgft.learning.dynamics import CommandMap, Dynamics, side_by_side
 from mpc_sgft.learning.fit import Maps, Penalty, fit_dynamics
 from mpc_sgft.learning.slices import Slices, to_slices
 from mpc_sgft.learning.world_model import WorldModel
@@ -37,7 +37,7 @@ def taught(agent, simulated: bool, updates: int = 300):
     machine.command.weight[:] = torch.cat([TRUTH, torch.zeros(A, 2 * A)], 1)
     own = copy.deepcopy(dynamics).requires_grad_(False)
     own.command = dynamics.command
-    agent.model.encode = lambda z: z  # latents in place of observations
+    agent.model.encode_corrected = lambda z: z  # latents in place of observations
     generator = torch.Generator().manual_seed(0)
     for _ in range(updates):
         data = to_slices(transitions(machine, generator), agent.device)
@@ -115,6 +115,19 @@ def test_the_map_that_goes_with_a_suspicion_acts_before_both() -> None:
         model.add_suspicion()
 
 
+def test_side_by_side_each_has_its_own_share_of_the_batch() -> None:
+    parts, generator = [two_maps().dynamics], torch.Generator().manual_seed(0)
+    parts += [copy.deepcopy(parts[0]), copy.deepcopy(parts[0])]
+    parts[1].band_acts.fill_(True)
+    parts[2].command = None
+    z = torch.rand(3, 4, 16 + 2 * A, generator=generator)
+    action = torch.rand(3, 4, A, generator=generator)
+    alone = torch.cat([dynamics(*share) for dynamics, *share in zip(parts, z, action, strict=True)])
+    together = side_by_side(parts)(z.flatten(0, 1), action.flatten(0, 1))
+    torch.testing.assert_close(together, alone)
+    assert not torch.allclose(side_by_side(parts[::-1])(z.flatten(0, 1), action.flatten(0, 1)), alone)
+
+
 def test_a_suspicion_needs_an_observation_map() -> None:
     model = two_maps()
     with pytest.raises(ValueError, match="add_observation_map"):
@@ -180,7 +193,7 @@ def test_a_threshold_is_told_from_a_weak_arm() -> None:
     machine.dynamics.banded.weight.mul_(0.9)
     machine.dynamics.banded.band.fill_(0.35)
     update = hand_over(agent, command_map=True, command_band=True, slice_len=T, lr=1e-6)
-    agent.model.encode = lambda z: z  # latents in place of observations
+    agent.model.encode_corrected = lambda z: z  # latents in place of observations
     generator = torch.Generator().manual_seed(0)
     for _ in range(400):
         update(transitions(machine.dynamics, generator))
@@ -236,7 +249,7 @@ def test_few_causes_are_preferred_where_commands_look_alike(weight: float) -> No
     machine.command.weight[:] = torch.cat([0.7 * torch.eye(A), torch.zeros(A, 2 * A)], 1)
     own = copy.deepcopy(dynamics).requires_grad_(False)
     own.command = dynamics.command
-    agent.model.encode = lambda z: z  # latents in place of observations
+    agent.model.encode_corrected = lambda z: z  # latents in place of observations
     action = (2 * torch.rand(1, B, A) - 1) + 0.02 * torch.randn(T, B, A)
     z = [torch.cat([torch.rand(B, 16), action[0].repeat(1, 2) + 0.02 * torch.randn(B, 2 * A)], 1)]
     for a in action:
@@ -261,7 +274,7 @@ def test_tdmpc2_may_be_given_a_command_map(mapped: bool) -> None:
     machine.requires_grad_(False)
     machine.dynamics.command.weight[:] = torch.cat([TRUTH, torch.zeros(A, 2 * A)], 1)
     update = hand_over(agent, "tdmpc2", command_map=mapped, lr=1e-6)
-    agent.model.encode = lambda z: z  # latents in place of observations
+    agent.model.encode_corrected = lambda z: z  # latents in place of observations
     generator, errors = torch.Generator().manual_seed(0), []
     for _ in range(300):
         errors.append(update(transitions(machine.dynamics, generator))["consistency_loss"])

@@ -4,8 +4,9 @@ import math
 
 import pytest
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
+from mpc_sgft.learning.dynamics import Dynamics
 from mpc_sgft.learning.fit import Maps, Penalty, Suspicion, fit_dynamics
 from mpc_sgft.learning.observation_map import ObservationMap, Sensed
 from mpc_sgft.learning.slices import Slices
@@ -86,11 +87,26 @@ def test_what_is_suspected_corrects_where_it_is_believed_and_not_small():
     assert sensors.outside(seen, *box, suspected=True).item() == pytest.approx(0.4**2 + 0.15**2 + 0.2**2)
 
 
-class Slope(nn.Module):
+@pytest.mark.parametrize("suspected", [True, False, None])
+def test_the_turn_learns_nothing_by_a_suspicion(suspected: bool | None):
+    sensors = ObservationMap([[0, 1]], torch.zeros(2), torch.ones(2), blocks=1)
+    sensors.doubted[0] = 1.0
+    sensors(torch.tensor([[1.0, 2.0]]), suspected=suspected).sum().backward()
+    assert (sensors.turn.grad is None) == (suspected is True)
+
+
+class Slope(Dynamics):
     """A puck that moves less the farther out it lies: so what it does tells where it is."""
 
-    def forward(self, z: Tensor, action: Tensor) -> Tensor:
-        return z + 0.3 * action / (1 + 4 * z.square())
+    def next(self, z: Tensor, commands: Tensor, realised: Tensor) -> Tensor:
+        return z + 0.3 * realised / (1 + 4 * z.square())
+
+
+class Rest(Dynamics):
+    """Nothing moves, and nothing tells where it is."""
+
+    def next(self, z: Tensor, commands: Tensor, realised: Tensor) -> Tensor:
+        return z.detach()
 
 
 @pytest.mark.parametrize("told", ["by dynamics", "by starts", "by suspicion"])
@@ -102,8 +118,8 @@ def test_a_shifted_sensor_is_found(told: str):
     agent.train_only(("dynamics", "observation_map"), lr=1e-3, policy_lr=1e-3, observation_lr=5e-3)
     sensors = model.observation_map
     sensors.doubted.fill_(told != "by suspicion")
-    model.encode = lambda o, suspected=None: sensors(o, suspected=suspected)
-    model.dynamics.forward = lambda z, action: z + 0 * model.dynamics.base[0].linear.bias.sum()
+    model.encode_corrected = lambda o: o
+    model.dynamics.next = lambda z, commands, realised: z + 0 * model.dynamics.base[0].linear.bias.sum()
     generator = torch.Generator().manual_seed(0)
     starts = torch.tensor([[0.0, 0.0], [0.1, 0.1]]) + offset
 
@@ -112,13 +128,15 @@ def test_a_shifted_sensor_is_found(told: str):
             return 0.0 * sensors.size()
         return sensors.outside(starts, torch.zeros(2), torch.full((2,), 0.1))
 
-    own = (lambda z, action: z.detach()) if told == "by starts" else Slope()
+    sizes = {"code_dim": 2, "memory_dim": 0, "action_dim": 2, "mlp_dim": 2, "simnorm_dim": 2}
+    truth = Slope(**sizes)
+    own = Rest(**sizes) if told == "by starts" else truth
     suspicion = Suspicion((sensors.shift,), own) if told == "by suspicion" else None
     for _ in range(400):
         action = 2 * torch.rand(4, 64, 2, generator=generator) - 1
         z = [2 * torch.rand(64, 2, generator=generator) - 1]
         for a in action:
-            z.append(Slope()(z[-1], a))
+            z.append(truth(z[-1], a))
         nothing = torch.zeros(4, 64)
         data = Slices(torch.stack(z) + offset, action, nothing, nothing.bool())
         maps = Maps((sensors,), own, (Penalty("doubt", 1.0, doubt),), suspicion=suspicion)
