@@ -23,6 +23,8 @@ class Verdict(NamedTuple):
     mapped: float | None = None  # error of the pretrained dynamics with the learned maps, where it is asked for
     band: Choice | None = None  # of these, with the first command map and with the second, which has a dead band
     suspicion: Choice | None = None  # with the command map that acts, without and with what sensors are suspected of
+    success: bool = False  # the rollout reached its goal
+    episode: int = 0  # number of the rollout
 
     def with_maps_of(self, other: "Verdict") -> float | None:
         """Error of the pretrained dynamics on this rollout with the maps that act after `other`."""

@@ -41,7 +41,8 @@ class AbstractMethod(ABC):
         action_noise: Standard deviation of the noise on real actions, action units.
         gate: When fine-tuned parts may act; None: at once.
         suspicion_margin: What the observation map suspects by how things move is corrected once it lowers the error of
-            the pretrained dynamics with the maps to this share, looked at as the gate does; 0: never.
+            the pretrained dynamics with the maps to this share, looked at as the gate does in rollouts that failed; 0:
+            never.
         average_decay: Of the averaged weights that are tested and act, per update; 0: the last ones.
         terminal: What plans end in, as `WorldModel` has it.
         policy_share: Of the way from the pretrained policy prior to the fine-tuned one that acts.

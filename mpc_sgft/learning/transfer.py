@@ -85,18 +85,17 @@ class Transfer:
         self.verdicts: list[Verdict] = []
         self.starts: list[Tensor] = []  # first observation of each rollout
 
-    def judge(self, steps: TensorDict) -> Verdict:
-        """Test the dynamics on a rollout [T] before it is learned from, and decide who acts next."""
+    def judge(self, steps: TensorDict, *, success: bool = False) -> Verdict:
+        """Test the dynamics on a rollout [T] before it is learned from, and decide who acts next; as in `learn`."""
 
         def error(model: WorldModel) -> float:
             return float(open_loop_error(model, steps, self.slice_len).nanmean())
 
         gate, last = self.method.gate, self.verdicts[-1] if self.verdicts else None
         limit = gate.excess * self._error_in_simulation() if gate and gate.excess else 0.0
-        mapped, band, suspicion = self._choose_maps(error, asked=limit > 0)
-        verdict = Verdict(
-            error(self.pretrained), error(self.averaged.model), gate is None, True, mapped, band, suspicion
-        )
+        mapped, band, suspicion = self._choose_maps(error, asked=limit > 0, success=success)
+        errors, episode = (error(self.pretrained), error(self.averaged.model)), int(steps["episode"][0])
+        verdict = Verdict(*errors, gate is None, True, mapped, band, suspicion, success, episode)
         if gate and last:
             seen = [*self.verdicts[1:], verdict][-gate.memory :]  # at the first rollout all were still the same
             accepted = begins([(v.fine_tuned, v.pretrained) for v in seen], last.accepted, gate.margin)
@@ -107,13 +106,15 @@ class Transfer:
         return verdict
 
     def _choose_maps(
-        self, error: Callable[[WorldModel], float], *, asked: bool
+        self, error: Callable[[WorldModel], float], *, asked: bool, success: bool
     ) -> tuple[float | None, Choice | None, Choice | None]:
         """What a verdict says of the maps; all models but the one that acts are told which of them act from now on.
 
         Args:
             error: Of a model on this rollout.
             asked: It is wanted even where there is nothing to choose.
+            success: The rollout reached its goal: it tells nothing of a suspicion. A sensor that lies by so much that
+                something is to be gained keeps rollouts from it, while other physics may look like such a sensor.
         """
         has_band, margin = self.agent.model.dynamics.banded is not None, self.method.suspicion_margin
         if not (asked or has_band or margin):
@@ -123,16 +124,19 @@ class Transfer:
         gate, before = self.method.gate or WITHOUT_GATE, self.verdicts[1:]
 
         def choose(
-            set_acting: Callable[[WorldModel, bool], object], choices: list[Choice | None], margin: float
+            set_acting: Callable[[WorldModel, bool], object],
+            acted: Choice | None,
+            told: list[Choice | None],
+            margin: float,
+            tells: bool = True,
         ) -> Choice:
-            errors = []
-            for acts in (False, True):
-                set_acting(simulator, acts)
+            errors, acts = [], bool(acted and acted.rival_acts)
+            for rival in (False, True):
+                set_acting(simulator, rival)
                 errors.append(error(simulator))
-            choice = Choice(errors[0], errors[1], False)
-            if self.verdicts:
-                pairs = [(c.rival, c.plain) for c in [*choices, choice] if c][-gate.memory :]
-                acts = bool(choices and choices[-1] and choices[-1].rival_acts)
+            choice = Choice(errors[0], errors[1], acts)
+            if self.verdicts and tells:
+                pairs = [(c.rival, c.plain) for c in [*told, choice] if c][-gate.memory :]
                 choice = choice._replace(rival_acts=begins(pairs, acts, margin))
             for model in (simulator, self.agent.model, self.averaged.model):
                 set_acting(model, choice.rival_acts)
@@ -140,9 +144,14 @@ class Transfer:
 
         if margin:
             simulator.suspect(False)  # until it is chosen
-        band = choose(WorldModel.use_band, [v.band for v in before], gate.margin) if has_band else None
+        last = before[-1] if before else None
+        band = suspicion = None
+        if has_band:
+            band = choose(WorldModel.use_band, last and last.band, [v.band for v in before], gate.margin)
         mapped = band.plain if band else error(simulator)
-        suspicion = choose(WorldModel.suspect, [v.suspicion for v in before], margin) if margin else None
+        if margin:
+            failed = [v.suspicion for v in before if not v.success]
+            suspicion = choose(WorldModel.suspect, last and last.suspicion, failed, margin, tells=not success)
         return mapped, band, suspicion
 
     def _error_in_simulation(self) -> float:
@@ -152,14 +161,17 @@ class Transfer:
             self.simulated_error = mean_error(self.pretrained, self._simulate(SIMULATED), self.slice_len)
         return self.simulated_error
 
-    def learn(self, steps: TensorDict, track: Callable[[range], Iterable[int]] = iter) -> dict[str, float]:
+    def learn(
+        self, steps: TensorDict, track: Callable[[range], Iterable[int]] = iter, *, success: bool = False
+    ) -> dict[str, float]:
         """Judge a rollout [T], learn from all there are, and hand over the parts that may act; returns metrics.
 
         Args:
-            steps: The rollout.
+            steps: The rollout, of one `episode`.
             track: Shows how far the gradient steps are, as tqdm does.
+            success: It reached its goal.
         """
-        verdict = self.judge(steps)
+        verdict = self.judge(steps, success=success)
         self.buffer.extend(steps)
         self.starts.append(steps["observation"][0].to(self.agent.device))
         starts, metrics = torch.stack(self.starts), dict[str, float]()
@@ -168,6 +180,10 @@ class Transfer:
             self.averaged.follow(self.agent.model)
         self._hand_over(verdict)
         return metrics | verdict.metrics()
+
+    def correct(self, episode: int, success: bool) -> None:
+        """Let a rollout, if it was learned from, have reached its goal or not; what acts now stays."""
+        self.verdicts = [v._replace(success=success) if v.episode == episode else v for v in self.verdicts]
 
     def batch(self) -> TensorDictBase:
         """What an update learns from, [B, T]: real slices, and as many simulated ones if the method wants them."""

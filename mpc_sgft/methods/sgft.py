@@ -53,8 +53,8 @@ class SGFT(AbstractMethod):
         start_weight: Weight of the squared distance from there.
         suspicion_margin: Where they start as they should, shifts are learned by what the simulator's dynamics can
             explain alone, with a command map of their own: what is touched moves. They correct something once
-            they lower the error on unseen rollouts to this share; 0: never. Other physics can look a little like it, so
-            this is less than the gate's.
+            they lower the error on unseen rollouts that failed to this share; 0: never. Other physics can look a little
+            like it, so this is less than the gate's.
         gate, gate_margin, gate_memory, gate_excess: Whether there is a gate, and its numbers (`Gate`).
         updates, slice_len, action_noise, average_decay, policy_share: As in `AbstractMethod`.
 

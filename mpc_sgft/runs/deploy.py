@@ -163,7 +163,7 @@ class Deployment:
         if len(valid) >= self.transfer.slice_len and not rollout.intervened:
             self.operator.enter("training", number)
             with self.watch("learn"):
-                metrics |= self.transfer.learn(valid, self.operator.track)
+                metrics |= self.transfer.learn(valid, self.operator.track, success=rollout.success)
             self.state["updates"] += self.transfer.method.updates
         self.state["rollouts"] = number
         self.state["aborted"] += rollout.aborted is not None

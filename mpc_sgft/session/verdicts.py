@@ -15,7 +15,7 @@ class CountedRun(Protocol):
 
     Attributes:
         state: Its counts: rollouts, successes, rerecorded, outcomes, scores.
-        transfer: What learns, with `state_dict` and `load_state_dict`.
+        transfer: What learns, with `state_dict`, `load_state_dict` and `correct`.
         metrics: Of the last rollout.
         judge: Evaluation episodes on the side; None where the real rollouts are the measure.
     """
@@ -125,6 +125,7 @@ class Verdicts:
         outcomes = run.state["outcomes"]
         outcomes[-1] = (success, outcomes[-1][1])
         run.state["successes"] = sum(s for s, _ in outcomes)
+        run.transfer.correct(number, success)
         if run.judge is None and run.state["scores"].pop(number, None) is not None:
             run.evaluate(None, run.metrics)
         if run.metrics:  # those of a rollout that an earlier process counted are not known any longer

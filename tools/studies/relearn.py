@@ -54,14 +54,16 @@ def config_of(run: Path, settings: list[str], seed: int) -> DictConfig:
     return cfg
 
 
-def rollouts_of(run: Path) -> list[TensorDict]:
-    """The valid steps [T] of each recorded rollout."""
+def rollouts_of(run: Path) -> list[tuple[TensorDict, bool]]:
+    """The valid steps [T] of each recorded rollout, and whether it reached its goal."""
     files = sorted((run / "episodes").glob("[0-9][0-9][0-9][0-9].mcap"))
-    steps = [from_episode(read_episode(file), number).steps for number, file in enumerate(files, 1)]
-    return [s[~s["next", "invalid"][:, 0]] for s in steps]
+    rollouts = [from_episode(read_episode(file), number) for number, file in enumerate(files, 1)]
+    return [(r.steps[~r.steps["next", "invalid"][:, 0]], r.success) for r in rollouts]
 
 
-def relearn(cfg: DictConfig, rollouts: list[TensorDict], at: list[int]) -> tuple[Transfer, dict[int, float]]:
+def relearn(
+    cfg: DictConfig, rollouts: list[tuple[TensorDict, bool]], at: list[int]
+) -> tuple[Transfer, dict[int, float]]:
     """Learn from rollouts in their order; returns what was learned, and the success after each number in `at`."""
     build.prepare_process(cfg)
     agent, _ = build.load_agent(cfg)
@@ -70,9 +72,9 @@ def relearn(cfg: DictConfig, rollouts: list[TensorDict], at: list[int]) -> tuple
     transfer = make_transfer(cfg, agent, build.sensed(cfg), judge.task.episode_steps)
     success = {}
     bar = progress(len(rollouts), initial=0, desc="relearn", unit="rollout", disable=False)
-    for count, steps in enumerate(rollouts, 1):
+    for count, (steps, reached) in enumerate(rollouts, 1):
         if len(steps) >= transfer.slice_len:
-            transfer.learn(steps)
+            transfer.learn(steps, success=reached)
         bar.update(1)
         if count in at:
             seed = evaluation_seed(cfg)

@@ -191,6 +191,32 @@ def test_a_suspicion_acts_once_it_tells_unseen_rollouts_much_better(acts: bool, 
     assert not t.pretrained.observation_map.suspects
 
 
+def test_what_succeeds_tells_nothing_of_a_suspicion(monkeypatch):
+    """It neither begins nor ends one, and does not count for a later rollout that fails."""
+    t = transfer(updates=1, of_method={"observation_map": True, "suspicion_margin": 0.5, "gate_memory": 2})
+    share = 0.1
+    monkeypatch.setattr(
+        "mpc_sgft.learning.transfer.open_loop_error",
+        lambda model, *_: torch.full((2, 2), share if model.observation_map.suspects else 1.0),
+    )
+
+    def acts(of: float, success: bool) -> bool:
+        nonlocal share
+        share = of
+        return bool(t.learn(rollout(t.pretrained, seed=len(t.verdicts)), success=success)["suspicion_acts"])
+
+    assert not acts(0.1, False)  # the first one
+    assert not acts(0.1, True) and not acts(0.1, True)
+    assert not acts(0.6, False)
+    assert not acts(0.1, True)
+    assert acts(0.3, False), "with the 0.6 before"
+    assert acts(9.0, True) and acts(9.0, True)
+    assert acts(1.1, False), "with the 0.3 before"
+    t.correct(t.verdicts[-1].episode, True)
+    assert acts(3.0, False), "with the 0.3 before: what was marked does not count"
+    assert not acts(1.1, False)
+
+
 def test_the_first_rollout_tells_nothing_of_a_suspicion(monkeypatch):
     """Then nothing has been learned, and both are the same but for rounding."""
     t = transfer(updates=1, of_method={"observation_map": True, "suspicion_margin": 0.5})

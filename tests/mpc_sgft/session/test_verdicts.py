@@ -13,6 +13,7 @@ from mpc_sgft.runs import build
 from mpc_sgft.runs.deploy import Deployment
 from mpc_sgft.session.corrections import amend
 from mpc_sgft.session.operator import Nobody
+from mpc_sgft.storage import checkpoint
 from mpc_sgft.storage.episode_file import EpisodeWriter, read_episode
 from mpc_sgft.storage.rollout import Press
 
@@ -58,6 +59,12 @@ def weights(folder: Path) -> dict[str, torch.Tensor]:
     return load_file(folder / "checkpoint" / "model.safetensors")
 
 
+def learned(folder: Path) -> list[tuple[int, bool]]:
+    """Which rollouts were learned from, and whether they count as successes there."""
+    state = checkpoint.load_state(folder / "checkpoint" / "state.pt")
+    return [(verdict["episode"], verdict["success"]) for verdict in state["transfer"]["verdicts"]]
+
+
 @pytest.fixture(scope="module")
 def plain(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("runs") / "plain"
@@ -88,6 +95,7 @@ def test_a_mark_overrides_what_the_task_computed(tmp_path, when):
     assert [k["key"] for k in marked.keys] == ["failure", "success"] and len(marked.transitions["step"]) == STEPS
     assert other.outcome["success"] is False and not other.keys
     assert [row["real_success"] for row in rows(tmp_path / "r", "metrics.csv")] == ["1.0", "0.0"]
+    assert learned(tmp_path / "r") == [(1, True), (2, False)]
 
 
 def test_a_person_is_asked_after_each_episode(tmp_path):
@@ -95,6 +103,7 @@ def test_a_person_is_asked_after_each_episode(tmp_path):
     summary = run(tmp_path / "r", operator, "success=ask")
     assert not operator.answers and summary["rerecorded"] == 1
     assert [row["real_success"] for row in rows(tmp_path / "r", "metrics.csv")] == ["1.0", "0.0"]
+    assert learned(tmp_path / "r") == [(1, True), (2, False)]
     assert json.loads((tmp_path / "r" / "summary.json").read_text()) == summary
 
 
