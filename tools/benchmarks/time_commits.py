@@ -1,10 +1,11 @@
 """A plan and an update as another commit makes them, beside those of this one: results/timing/time_commits.csv.
 
-    python -m tools.benchmarks.time_commits COMMIT [--sizes small 1M] [--precisions auto float32] [--out CSV]
+    python -m tools.benchmarks.time_commits COMMIT [--what plan update] [--sizes small 1M] [--precisions auto float32]
 
 Each commit has a checkout and a process of its own, with one thread; they are timed in turn. The plan is the configured
 one (configs/planner/mppi.yaml), the update that of pretraining (configs/train/default.yaml) on 256 slices of three
-steps, the weights are random ones. A commit that knows no `precision` computes in float32. `ratio` is this commit's
+steps, `adapt` an update of a deployment with all its maps (configs/method/sgft.yaml) on as many of four, the weights
+are random ones. A commit that knows no `precision` computes in float32. `ratio` is this commit's
 best time to the other's.
 """
 
@@ -26,6 +27,7 @@ from tools.studies.runner import write
 
 COLUMNS = "what size precision before after before_ms after_ms ratio rounds cpu torch".split()
 ROUNDS = 15
+WORK = ["plan", "update", "adapt"]
 CHILD = """  # runs in either checkout, and so asks for what both have
 import json, sys, time
 own = [f for f in sys.meta_path if not getattr(f, "__module__", "").startswith("__editable__")]
@@ -36,7 +38,7 @@ from omegaconf import OmegaConf
 from mpc_sgft.runs.collect import planner_policy
 from planners.malloc import keep_freed_memory
 from tools.benchmarks.time_planner import random_batch
-size, precision, obs_dim, action_dim = *sys.argv[1:3], *map(int, sys.argv[3:])
+whats, size, precision, obs_dim, action_dim = *sys.argv[1:4], *map(int, sys.argv[4:])
 def configured(path):
     cfg = OmegaConf.load(path)
     for part in (cfg, cfg.get("agent", {})):
@@ -47,12 +49,25 @@ keep_freed_memory()
 torch.set_num_threads(1)
 torch.manual_seed(0)
 sizes = {"obs_dim": obs_dim, "action_dim": action_dim, "decode_dim": min(obs_dim, 12)}
-model = instantiate(OmegaConf.load(f"configs/model/{size}.yaml"), **sizes)
-agent = instantiate(configured("configs/train/default.yaml").agent, model=model, discount=0.99)
+def agent_of(**more):
+    model = instantiate(OmegaConf.load(f"configs/model/{size}.yaml"), **sizes, **more)
+    return instantiate(configured("configs/train/default.yaml").agent, model=model, discount=0.99)
+agent = agent_of()
 planner = instantiate(configured("configs/planner/mppi.yaml"), action_dim=action_dim, discount=0.99)
-act, seen, fresh = planner_policy(model, planner, seed=0), torch.randn(1, obs_dim), torch.ones(1, dtype=torch.bool)
+act = planner_policy(agent.model, planner, seed=0)
+seen, fresh = torch.randn(1, obs_dim), torch.ones(1, dtype=torch.bool)
 batch, times = random_batch(obs_dim, action_dim, 3), 5
 calls = {"plan": lambda: act(seen, fresh), "update": lambda: agent.update(batch)}
+if "adapt" in whats.split(","):
+    from mpc_sgft.learning.observation_map import Sensed
+    numbers = OmegaConf.load("configs/method/sgft.yaml")
+    numbers.horizon = 4
+    method, starts = instantiate(numbers), torch.randn(8, obs_dim)
+    names = ("tip_x", "tip_y", *(f"sensor_{i}" for i in range(2, sizes["decode_dim"])))
+    deployed = agent_of(memory_dim=2 * action_dim)
+    method.take_over(deployed, Sensed(names, starts[:, : len(names)]))
+    slices = random_batch(obs_dim, action_dim, 4)
+    calls["adapt"] = lambda: method.update(deployed, slices, starts=starts)
 for line in sys.stdin:
     call, found = calls[line.strip()], []
     for _ in range(times):
@@ -89,11 +104,11 @@ def checkout(commit: str) -> Iterator[Path]:
 
 
 @contextmanager
-def worker(tree: Path, size: str, precision: str) -> Iterator[subprocess.Popen[str]]:
+def worker(tree: Path, whats: list[str], size: str, precision: str) -> Iterator[subprocess.Popen[str]]:
     """A process that times what its standard input names, with the code of a checkout."""
     spaces = [str(n) for n in SPACES.get(size, UPSTREAM)]
     own = os.environ | {"PYTHONPATH": str(tree), "OMP_NUM_THREADS": "1"}
-    line = [sys.executable, "-c", CHILD, size, precision, *spaces]
+    line = [sys.executable, "-c", CHILD, ",".join(whats), size, precision, *spaces]
     with subprocess.Popen(line, cwd=tree, env=own, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
         yield process
         assert process.stdin
@@ -117,12 +132,14 @@ def milliseconds(process: subprocess.Popen[str], what: str) -> float:
     return float(json.loads(line))
 
 
-def measure(trees: list[Path], size: str, precision: str, names: list[str], rounds: int) -> list[dict[str, object]]:
-    """A row for the plan and one for the update of a model size."""
+def measure(
+    trees: list[Path], size: str, precision: str, whats: list[str], names: list[str], rounds: int
+) -> list[dict[str, object]]:
+    """A row for each work with a model size."""
     rows: list[dict[str, object]] = []
     with ExitStack() as stack:
-        workers = [stack.enter_context(worker(tree, size, precision)) for tree in trees]
-        for what in ("plan", "update"):
+        workers = [stack.enter_context(worker(tree, whats, size, precision)) for tree in trees]
+        for what in whats:
             found = [[milliseconds(process, what) for process in workers] for _ in range(rounds + 1)][1:]
             before, after = (min(column) for column in zip(*found, strict=True))
             row: dict[str, object] = {
@@ -140,6 +157,7 @@ def measure(trees: list[Path], size: str, precision: str, names: list[str], roun
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("commit", help="as git names it")
+    parser.add_argument("--what", nargs="+", default=WORK[:2], choices=WORK)
     parser.add_argument("--sizes", nargs="+", default=["small", "1M"], choices=known_sizes())
     parser.add_argument("--precisions", nargs="+", default=["auto", "float32"])
     parser.add_argument("--rounds", type=int, default=ROUNDS, help="of five calls each")
@@ -149,7 +167,7 @@ def main(arguments: list[str] | None = None) -> int:
     with ExitStack() as stack:
         trees = [stack.enter_context(checkout(name)) for name in names]
         pairs = itertools.product(args.sizes, args.precisions)
-        rows = [row for pair in pairs for row in measure(trees, *pair, names, args.rounds)]
+        rows = [row for pair in pairs for row in measure(trees, *pair, args.what, names, args.rounds)]
     write(args.out, COLUMNS, rows)
     print(f"written to {args.out}")
     return 0

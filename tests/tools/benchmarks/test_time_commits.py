@@ -39,15 +39,19 @@ def test_each_commit_is_timed_with_its_own_numbers(git, tmp_path):
     before = commit(git, "A plan of four iterations")
     planner = time_commits.ROOT / "configs" / "planner" / "mppi.yaml"
     planner.write_text(planner.read_text().replace("iterations: 4 ", "iterations: 200 "))
+    method = time_commits.ROOT / "configs" / "method" / "sgft.yaml"
+    method.write_text(method.read_text().replace("observation_map: true", "observation_map: false"))
     after = commit(git, "A plan of two hundred")
     there, out = git("worktree", "list"), tmp_path / "out.csv"
-    words = ["--sizes", "small", "--precisions", "float32", "--rounds", "1", "--out", str(out)]
+    words = ["--what", "plan", "update", "adapt", "--sizes", "small", "--precisions", "float32"]
+    words += ["--rounds", "1", "--out", str(out)]
     assert time_commits.main([before, *words]) == 0
     with out.open(newline="") as file:
-        plan, update = csv.DictReader(file)
-    assert (plan["what"], update["what"]) == ("plan", "update")
-    assert {(row["before"], row["after"]) for row in (plan, update)} == {(before, after)}
+        plan, update, adapt = csv.DictReader(file)
+    assert (plan["what"], update["what"], adapt["what"]) == ("plan", "update", "adapt")
+    assert {(row["before"], row["after"]) for row in (plan, update, adapt)} == {(before, after)}
     assert float(plan["ratio"]) > 3  # about forty on a quiet machine
+    assert float(adapt["before_ms"]) > 0 and float(adapt["after_ms"]) > 0
     assert float(plan["ratio"]) == pytest.approx(float(plan["after_ms"]) / float(plan["before_ms"]), rel=0.1)
     assert git("worktree", "list") == there
 
