@@ -94,8 +94,16 @@ class Transfer:
         gate, last = self.method.gate, self.verdicts[-1] if self.verdicts else None
         limit = gate.excess * self._error_in_simulation() if gate and gate.excess else 0.0
         mapped, band, suspicion = self._choose_maps(error, asked=limit > 0, success=success)
-        errors, episode = (error(self.pretrained), error(self.averaged.model)), int(steps["episode"][0])
-        verdict = Verdict(*errors, gate is None, True, mapped, band, suspicion, success, episode)
+        verdict = Verdict(
+            error(self.pretrained),
+            error(self.averaged.model),
+            gate is None,
+            mapped=mapped,
+            band=band,
+            suspicion=suspicion,
+            success=success,
+            episode=int(steps["episode"][0]),
+        )
         if gate and last:
             seen = [*self.verdicts[1:], verdict][-gate.memory :]  # at the first rollout all were still the same
             accepted = begins([(v.fine_tuned, v.pretrained) for v in seen], last.accepted, gate.margin)

@@ -44,6 +44,7 @@ def retrain(
     from mpc_sgft.runs.deploy import deploy
     from mpc_sgft.runs.pretrain import pretrain
 
+    run, out = run.resolve(), out.resolve()  # runs/latest is another run as soon as pretraining begins
     cfg, before = run_config(run), outcome(run)
     made = pretrain_config(cfg, out / "pretrain", transitions, effects=effects, randomize=randomize)
     _finish(pretrain(made), "pretraining")

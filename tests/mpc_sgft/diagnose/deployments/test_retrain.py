@@ -6,10 +6,12 @@ import json
 from pathlib import Path
 
 import pytest
+from omegaconf import OmegaConf
 
 from mpc_sgft.command import compose
 from mpc_sgft.command.errors import UserError
-from mpc_sgft.diagnose.deployments.retrain import outcome, pretrain_config, table
+from mpc_sgft.diagnose.deployments.retrain import outcome, pretrain_config, retrain, table
+from mpc_sgft.storage import run_folder
 
 FOUND = {"actuator_gain": {"gain": 0.52}, "payload": {"mass": 0.4, "at": ["puck"]}}
 
@@ -31,6 +33,28 @@ def test_the_comparison_counts_rollouts_to_95_percent(tmp_path: Path) -> None:
     assert after == summary | {"rollouts_to_95": 5}
     lines = table({"before": after | {"rollouts_to_95": None}, "after": after}).splitlines()
     assert lines[1].endswith("> 10") and lines[2].split("|")[1].strip() == "10%" and lines[2].endswith(" 5")
+
+
+def test_the_latest_run_stays_the_one_that_was_diagnosed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Both runs are real ones but for what they compute: they begin their folder, and so take over `latest`."""
+    monkeypatch.chdir(tmp_path)
+    summary = {"zero_shot_success": 0.1, "final_success": 0.2, "real_rollouts": 1, "curve": {"0": 0.1}}
+
+    def run(cfg) -> int:
+        folder = run_folder.start(cfg)
+        (folder / "summary.json").write_text(json.dumps(summary | {"final_success": 0.9}))
+        return 0
+
+    monkeypatch.setattr("mpc_sgft.runs.pretrain.pretrain", run)
+    monkeypatch.setattr("mpc_sgft.runs.deploy.deploy", run)
+    first = run_folder.start(compose.compose("deploy", ["task=push"], []))
+    (first / "summary.json").write_text(json.dumps(summary))
+    found = retrain(Path("runs/push/latest"), Path("runs/push/latest/diagnosis"), 10, effects=FOUND)
+    assert (found["before"]["final_success"], found["after"]["final_success"]) == (0.2, 0.9)
+    assert json.loads((first / "diagnosis" / "retrain.json").read_text()) == found
+    assert Path("runs/push/latest").resolve() == first / "diagnosis" / "deploy"
+    cfg = OmegaConf.load(first / "diagnosis" / "deploy" / "config.yaml")
+    assert Path(cfg.checkpoint) == first / "diagnosis" / "pretrain"
 
 
 def test_an_unfinished_run_is_no_baseline(tmp_path: Path) -> None:
