@@ -1,5 +1,6 @@
 """What MkDocs fills in while it builds: results, settings, effects, equations. Nothing of these is typed twice."""
 
+import dataclasses
 import re
 import shutil
 from pathlib import Path
@@ -54,14 +55,12 @@ def _plain(tex: str) -> str:
 
 def settings() -> str:
     """Every yaml of configs/ but the gaps, with its comments: the one place where a number lives."""
-    parts = []
+    parts = ["### The commands' own", *(_block(path) for path in sorted(choices.CONFIG_DIR.glob("*.yaml")))]
     for group, names in choices.groups().items():
         if group == "gap":
             continue
         parts.append(f"### {group}\n\n{group}= " + ", ".join(f"`{name}`" for name in names))
-        for name in names:
-            text = (choices.CONFIG_DIR / group / f"{name}.yaml").read_text().rstrip()
-            parts.append(f'??? note "`configs/{group}/{name}.yaml`"\n\n    ```yaml\n' + _indent(text) + "\n    ```")
+        parts += [_block(choices.CONFIG_DIR / group / f"{name}.yaml") for name in names]
     rows = []
     for path in sorted((choices.CONFIG_DIR / "gap").glob("*.yaml")):
         what = yaml.safe_load(path.read_text()).get("effects") or {}
@@ -69,18 +68,36 @@ def settings() -> str:
     return "\n\n".join([*parts, "### gap", table(["gap=", "what is hidden"], rows)])
 
 
+def _block(path: Path) -> str:
+    """A file of configs/ that is shown when it is clicked on."""
+    name, text = path.relative_to(choices.CONFIG_DIR), path.read_text().rstrip()
+    return f'??? note "`configs/{name}`"\n\n    ```yaml\n' + _indent(text) + "\n    ```"
+
+
 def _indent(text: str) -> str:
     return "\n".join("    " + line if line else "" for line in text.splitlines())
 
 
 def effects() -> str:
-    """The effects, by the first line of what each file says of itself."""
+    """The effects, by the first line of what each file says of itself, and their parameters."""
     from importlib import import_module
 
     from envs.effects import available
 
     rows = []
     for name in available():
-        line = (import_module(f"envs.effects.{name}").__doc__ or "").strip().splitlines()[0]
-        rows.append([f"`{name}`", line])
-    return table(["effect", "what reality has"], rows)
+        module = import_module(f"envs.effects.{name}")
+        line = (module.__doc__ or "").strip().splitlines()[0]
+        parameters = [_parameter(module.EFFECT, field) for field in dataclasses.fields(module.EFFECT)]
+        rows.append([f"`{name}`", line, "; ".join(parameters)])
+    return table(["effect", "what reality has", "parameters"], rows)
+
+
+def _parameter(effect: Any, field: dataclasses.Field) -> str:
+    """Name, unit, bounds and default of a parameter."""
+    said = [unit] if (unit := effect.units.get(field.name)) else []
+    if field.name in effect.bounds:
+        said.append("{:g} to {:g}".format(*effect.bounds[field.name]))
+    if field.default not in (dataclasses.MISSING, None, ()):
+        said.append(f"{field.default} if not given")
+    return f"`{field.name}`" + (f" ({', '.join(said)})" if said else "")

@@ -15,6 +15,11 @@ def test_every_fill_leaves_no_mark_behind() -> None:
     assert (
         "{{ results" not in text and "`turned`" in text and "`stribeck_friction`" in text and "num_elites: 96" in text
     )
+    assert "`gain` (1, -5 to 5, 1.0 if not given)" in text and "eval_every: " in text
+
+
+def test_blocks_that_open_when_clicked_on_are_known() -> None:
+    assert "??? note" in docs_hooks.settings() and "pymdownx.details" in (ROOT / "mkdocs.yml").read_text()
 
 
 def test_equations_become_mathml() -> None:
