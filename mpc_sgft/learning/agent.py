@@ -262,7 +262,7 @@ class Agent:
             policy_lr: Of Adam for the policy prior.
             command_lr: Of Adam for the command map of the dynamics; None: lr.
             observation_lr: Of Adam for the observation map; None: lr.
-            following: Parts that updates change without a gradient.
+            following: Parts, or single buffers, that change without a gradient.
         """
         self.pretraining, self.trainable = False, (*parts, *following)
         self.policy_delay, self.td_lambda = 1, 0.0
@@ -374,7 +374,7 @@ class Agent:
                 parameter.requires_grad_(True)
 
     def _trains(self, name: str) -> bool:
-        return any(name.startswith(part + ".") for part in self.trainable)
+        return any(name == part or name.startswith(part + ".") for part in self.trainable)
 
     def _decoder_loss(self, z: Tensor, observation: Tensor) -> Tensor:
         wanted = self.model.normalizer(observation)[..., : self.model.sizes["decode_dim"]]

@@ -107,7 +107,8 @@ class SliceSampler(Sampler):
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         for name in ROWS:
-            getattr(self, name).copy_(state_dict[name])
+            rows, saved = getattr(self, name), state_dict[name]
+            rows[: len(saved)] = saved[: len(rows)]
         self.tails = {e: (row, step) for e, row, step in state_dict["tails"].tolist()}
         self.generator.set_state(state_dict["generator"].cpu())
         self._starts = None
@@ -169,19 +170,20 @@ class SliceBuffer:
         return {"data": {k: v.clone() for k, v in data.items()}, "writer": writer, "sampler": self.sampler.state_dict()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Take over a `state_dict` of a buffer of the same capacity.
+        """Take over a `state_dict`, of a buffer of the same capacity or of one that was not full and whose rows fit.
 
         Raises:
-            ValueError: If the capacities differ.
+            ValueError: If the capacities differ otherwise.
         """
         rows = len(state["sampler"]["valid"])
-        if rows != self.capacity:
+        n = len(next(iter(state["data"].values()))) if state["data"] else 0
+        if rows != self.capacity and (n == rows or n > self.capacity):
             raise ValueError(
-                f"The saved buffer holds {rows} rows, this one {self.capacity}; keep the capacity when resuming."
+                f"The saved buffer has {n} of {rows} rows, this one room for {self.capacity}; keep the capacity when "
+                "resuming."
             )
         self._replay.empty()
-        if state["data"]:
-            n = len(next(iter(state["data"].values())))
+        if n:
             data = TensorDict(state["data"], batch_size=[n]).unflatten_keys("/")
             self._replay.storage.set(torch.arange(n), data.to(self.device))  # type: ignore[arg-type]
         self._replay.writer.load_state_dict(state["writer"])

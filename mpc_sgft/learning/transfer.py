@@ -243,8 +243,15 @@ class Transfer:
 
 
 def mean_error(model: WorldModel, episodes: TensorDict, horizon: int) -> float:
-    """Geometric mean over episodes [N, T] of the mean `open_loop_error`."""
-    return statistics.geometric_mean(float(open_loop_error(model, steps, horizon).nanmean()) for steps in episodes)
+    """Geometric mean of the mean `open_loop_error` of the episodes in rows [N, T], which may have ended early."""
+    errors = []
+    for row in episodes:
+        valid = row[~row["next", "invalid"][:, 0]]
+        for number in valid["episode"].unique().tolist():
+            steps = valid[valid["episode"] == number]
+            if len(steps) >= horizon:
+                errors.append(float(open_loop_error(model, steps, horizon).nanmean()))
+    return statistics.geometric_mean(errors)
 
 
 @torch.inference_mode()

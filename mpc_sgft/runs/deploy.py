@@ -25,6 +25,7 @@ from mpc_sgft.runs.explore import explored
 from mpc_sgft.runs.pretrain import StopRequest, Stopwatch, evaluation_seed
 from mpc_sgft.runs.real_rollout import begin, drive, start_seed
 from mpc_sgft.session import person
+from mpc_sgft.session.corrections import forget_audit
 from mpc_sgft.session.operator import Nobody, Operator
 from mpc_sgft.session.verdicts import Verdicts
 from mpc_sgft.storage import checkpoint, run_folder
@@ -210,18 +211,22 @@ class Deployment:
             raise
         if self.verdicts.again(number - 1):
             return None
-        return drive(
-            self.env,
-            model,
-            planner,
-            path,
-            number=number,
-            seed=seed,
-            noise=self.transfer.method.action_noise,
-            candidate_steps=tuple(cfg.candidate_steps),
-            operator=self.operator,
-            state=state,
-        )
+        try:
+            return drive(
+                self.env,
+                model,
+                planner,
+                path,
+                number=number,
+                seed=seed,
+                noise=self.transfer.method.action_noise,
+                candidate_steps=tuple(cfg.candidate_steps),
+                operator=self.operator,
+                state=state,
+            )
+        except BaseException:  # a mark of the rollout before must not go with it
+            self.verdicts.late(number - 1)
+            raise
 
     def show_counts(self) -> None:
         """Tell the operator how the session stands."""
@@ -241,6 +246,7 @@ class Deployment:
         model, horizon = self.transfer.acting, self.cfg.planner.horizon
         error = open_loop_error(model, rollout.steps, horizon)
         found = audit(model, rollout.steps, self.cfg.task.discount, seed=number)
+        forget_audit(self.folder / "audit.csv", number)  # a process that was killed while it learned had written it
         write_audit(self.folder / "audit.csv", number, rollout.steps, found.margin, self.env.task.observation_names)
         metrics = {
             "real_success": float(rollout.success),
@@ -283,7 +289,7 @@ class Deployment:
 
     def save(self) -> None:
         """Weights and exact state."""
-        self.state["seconds"] = time.monotonic() - self.began
+        self.state |= {"seconds": time.monotonic() - self.began, "spent": self.watch.spent}
         path = self.folder / "checkpoint"
         meta = checkpoint.describe(self.cfg, self.transfer.acting)
         checkpoint.save(path / "model.safetensors", self.transfer.acting, meta)
@@ -293,6 +299,15 @@ class Deployment:
         path = self.folder / "checkpoint" / "state.pt"
         if path.exists():
             stored = checkpoint.load_state(path)
+            if any("episode" not in verdict for verdict in stored["transfer"]["verdicts"]):
+                raise UserError(
+                    f"cannot resume {self.cfg.resume}: an earlier version wrote it (it did not keep which rollouts "
+                    "succeeded). Go on with that version; versions.json there names its commit."
+                )
+            if (done := stored["loop"]["rollouts"]) > self.cfg.rollouts:
+                raise UserError(
+                    f"rollouts={self.cfg.rollouts}: {self.cfg.resume} has {done} already. Give as many or more."
+                )
             self.state |= stored["loop"]
             self.transfer.load_state_dict(stored["transfer"])
 

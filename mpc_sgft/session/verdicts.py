@@ -55,7 +55,7 @@ class Verdicts:
     def remember(self) -> None:
         """Keep what there is, so that the next rollout can be undone."""
         run = self.run
-        self._before = copy.deepcopy({"loop": run.state, "transfer": run.transfer.state_dict()})
+        self._before = copy.deepcopy({"loop": run.state, "transfer": run.transfer.state_dict(), "metrics": run.metrics})
 
     def of(self, rollout: Rollout, number: int) -> Rollout | None:
         """A rollout that does not count yet, with what a person says of it; None if it is to be driven again."""
@@ -110,7 +110,7 @@ class Verdicts:
         run, before = self.run, self._before
         assert before is not None
         before["loop"]["rerecorded"] = run.state["rerecorded"] + 1
-        run.state, self._before = before["loop"], None
+        run.state, run.metrics, self._before = before["loop"], before["metrics"], None
         run.transfer.load_state_dict(before["transfer"])
         run.save()  # first: if the process is killed here, the recording is there and counts
         set_aside(run.path(number))
@@ -126,10 +126,11 @@ class Verdicts:
         outcomes[-1] = (success, outcomes[-1][1])
         run.state["successes"] = sum(s for s, _ in outcomes)
         run.transfer.correct(number, success)
+        measured = dict[str, float]()
         if run.judge is None and run.state["scores"].pop(number, None) is not None:
-            run.evaluate(None, run.metrics)
+            run.evaluate(None, measured)
         if run.metrics:  # those of a rollout that an earlier process counted are not known any longer
-            run.metrics["real_success"] = float(success)
+            run.metrics |= measured | {"real_success": float(success)}
             run.logger.close()
             run.logger = run.make_logger(number - 1)
             run.logger.log(number, run.metrics)

@@ -63,6 +63,7 @@ if "adapt" in whats.split(","):
     numbers = OmegaConf.load("configs/method/sgft.yaml")
     numbers.horizon = 4
     method, starts = instantiate(numbers), torch.randn(8, obs_dim)
+    sizes["decode_dim"] = min(obs_dim - 2 * action_dim, 12)
     names = ("tip_x", "tip_y", *(f"sensor_{i}" for i in range(2, sizes["decode_dim"])))
     deployed = agent_of(memory_dim=2 * action_dim)
     method.take_over(deployed, Sensed(names, starts[:, : len(names)]))

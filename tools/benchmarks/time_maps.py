@@ -35,7 +35,7 @@ WAYS = {  # what leaves the later ones out
 
 def calls(task: str, settings: list[str]) -> dict[str, Callable[[], object]]:
     """An update and a plan of a deployment with these settings."""
-    cfg = compose("deploy", [f"task={task}", "gap=none", "quiet=true", "log.rerun=false", *settings], [])
+    cfg = compose("deploy", [f"task={task}", "gap=none", "device=cpu", "quiet=true", *settings], [])
     build.prepare_process(cfg)
     agent, _ = build.load_agent(cfg)
     steps = explored(cfg, agent.model, EPISODES)

@@ -1,5 +1,6 @@
 """The gate between what trains and what acts, and the command map that a few rollouts can teach."""
 
+import math
 from pathlib import Path
 
 import pytest
@@ -10,7 +11,7 @@ from tensordict import TensorDict
 from mpc_sgft.learning.agent import Agent
 from mpc_sgft.learning.choice import Choice, Verdict, begins
 from mpc_sgft.learning.observation_map import Sensed
-from mpc_sgft.learning.transfer import Transfer, open_loop_error
+from mpc_sgft.learning.transfer import Transfer, mean_error, open_loop_error
 from mpc_sgft.learning.world_model import WorldModel
 from mpc_sgft.methods.sgft import SGFT
 from tests.mpc_sgft.learning.agents import SENSED
@@ -300,6 +301,28 @@ def test_a_saved_transfer_goes_on_with_the_same_numbers():
     again.learn(rollout(again.pretrained, seed=2))
     assert same(once.agent.model, again.agent.model) and once.verdicts == again.verdicts
     assert same(once.averaged.model, again.averaged.model) and same(once.acting, again.acting)
+
+
+def test_an_episode_that_ended_early_is_not_imagined_beyond():
+    model = make_agent().model
+    parts = [rollout(model, 6, seed=1), rollout(model, 4, seed=2), rollout(model, 1, seed=3)]
+    parts[1]["next", "invalid"][-1] = True
+    alone = [open_loop_error(model, steps, 2).nanmean().item() for steps in (parts[0], parts[1][:-1])]
+    row = torch.cat(parts).unsqueeze(0)
+    assert mean_error(model, row, 2) == pytest.approx(math.sqrt(math.prod(alone)))
+
+
+def test_which_maps_act_is_nothing_that_was_frozen():
+    """With a residual as well, where the rest of the dynamics is."""
+    numbers = {"residual": True, "command_map": True, "command_band": True, "observation_map": True}
+    t = transfer(updates=1, sizes=MEMORY, of_method=numbers | {"suspicion_margin": 0.5})
+    frozen = t.agent.frozen_hash()
+    t.agent.model.use_band(True)
+    t.agent.model.suspect(True)
+    assert t.agent.frozen_hash() == frozen
+    with torch.no_grad():
+        t.agent.model.dynamics.base[0].linear.bias += 1.0
+    assert t.agent.frozen_hash() != frozen
 
 
 def test_open_loop_error_by_hand():

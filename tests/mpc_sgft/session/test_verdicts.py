@@ -6,11 +6,13 @@ from pathlib import Path
 
 import pytest
 import torch
+from omegaconf import DictConfig
 from safetensors.torch import load_file
 
 from mpc_sgft.command import compose
-from mpc_sgft.runs import build
-from mpc_sgft.runs.deploy import Deployment
+from mpc_sgft.command.errors import UserError
+from mpc_sgft.learning.transfer import Transfer
+from mpc_sgft.runs import build, deploy
 from mpc_sgft.session.corrections import amend
 from mpc_sgft.session.operator import Nobody
 from mpc_sgft.storage import checkpoint
@@ -44,10 +46,20 @@ class Script:
         self.presses.append(Press(self.answers.pop(0), 1e9, self.episode))
 
 
-def run(folder: Path, operator: Script | None, *more: str) -> dict:
-    cfg = compose.compose("deploy", [*SMALL, f"run_dir={folder}", *more], [])
+def run(folder: Path, operator: Script | None, *more: str, judged: bool = True) -> dict:
+    return loop(compose.compose("deploy", [*SMALL, f"run_dir={folder}", *more], []), operator, judged)
+
+
+def go_on(folder: Path, operator: Script | None, *more: str) -> dict:
+    """Resume a run that nobody judges."""
+    return loop(compose.resume("deploy", str(folder), more, more), operator, judged=False)
+
+
+def loop(cfg: DictConfig, operator: Script | None, judged: bool) -> dict:
     agent, _ = build.load_agent(cfg)
-    return Deployment(cfg, agent, build.make_env(cfg, 1), build.make_env(cfg, 2), operator).loop()
+    env, judge = build.make_env(cfg, 1), build.make_env(cfg, 2) if judged else None
+    env.backend.report = dict  # as a robot's, which nobody judges, has one
+    return deploy.Deployment(cfg, agent, env, judge, operator).loop()
 
 
 def rows(folder: Path, name: str) -> list[dict]:
@@ -82,8 +94,67 @@ def test_a_rollout_driven_again_leaves_no_trace_in_what_was_learned(plain, tmp_p
     assert aside.complete and [k["key"] for k in aside.keys] == ["rerecord"]
     ours, theirs = weights(tmp_path / "r"), weights(plain)
     assert all(torch.equal(ours[k], theirs[k]) for k in theirs)
+    spent = checkpoint.load_state(tmp_path / "r" / "checkpoint" / "state.pt")["loop"]["spent"]
+    assert {k: round(v, 1) for k, v in spent.items()} == pytest.approx(summary["seconds"], abs=0.11)
     for name in ("metrics.csv", "audit.csv"):
         assert rows(tmp_path / "r", name) == rows(plain, name), name
+
+
+def test_a_mark_after_an_undo_changes_the_rollout_before_alone(tmp_path):
+    class Marked(Script):
+        def enter(self, phase: str, episode: int) -> None:
+            super().enter(phase, episode)
+            if (phase, episode) == ("resetting", 2):
+                self.keys["resetting", 1] = ["success"]
+
+    run(tmp_path / "plain", None, "rollouts=3")
+    run(tmp_path / "r", Marked({("resetting", 2): ["rerecord"]}), "rollouts=3")
+    before, after = (rows(tmp_path / name, "metrics.csv") for name in ("plain", "r"))
+    assert before[0].pop("real_success") == "0.0" and after[0].pop("real_success") == "1.0"
+    assert after[0] == before[0]
+
+
+def test_what_is_left_of_a_session_goes_on_with_more_rollouts(tmp_path):
+    """As on a robot: the real rollouts are the measure. A mark of the last one keeps what was measured of it."""
+    folder = tmp_path / "r"
+    run(folder, None, "rollouts=2", "eval_every=1", judged=False)
+    before = rows(folder, "metrics.csv")
+    with pytest.raises(UserError, match="rollouts=1: .* has 2 already. Give as many or more"):
+        go_on(folder, None, "rollouts=1")
+    go_on(folder, Script({("resetting", 2): ["success"]}), "rollouts=3")
+    after = rows(folder, "metrics.csv")
+    assert after[:2] == before and len(after) == 3, "what an earlier process measured stays"
+    assert learned(folder) == [(1, False), (2, True), (3, False)]
+    path = folder / "checkpoint" / "state.pt"
+    state = checkpoint.load_state(path)
+    del state["transfer"]["verdicts"][0]["episode"]
+    checkpoint.save_state(path, state)
+    with pytest.raises(UserError, match="an earlier version wrote it"):
+        go_on(folder, None)
+
+
+def test_what_a_rollout_that_breaks_down_leaves_behind(tmp_path, monkeypatch):
+    """The mark of the one before is kept; one that was measured and not learned from is not audited twice."""
+    drive, learn = deploy.drive, Transfer.learn
+
+    def broken(*args, number: int, **more):
+        if number == 2:
+            raise RuntimeError("the line is dead")
+        return drive(*args, number=number, **more)
+
+    monkeypatch.setattr(deploy, "drive", broken)
+    with pytest.raises(RuntimeError, match="the line is dead"):
+        run(tmp_path / "r", Script({("resetting", 1): ["success"]}), judged=False)
+    assert read_episode(tmp_path / "r" / "episodes" / "0001.mcap").outcome["success"] is True
+    assert [row["real_success"] for row in rows(tmp_path / "r", "metrics.csv")] == ["1.0"]
+    monkeypatch.setattr(deploy, "drive", drive)
+    monkeypatch.setattr(Transfer, "learn", lambda *_, **__: (_ for _ in ()).throw(FloatingPointError("not finite")))
+    with pytest.raises(FloatingPointError):
+        go_on(tmp_path / "r", None)
+    monkeypatch.setattr(Transfer, "learn", learn)
+    go_on(tmp_path / "r", None)
+    audited = [(row["rollout"], row["step"]) for row in rows(tmp_path / "r", "audit.csv")]
+    assert audited == [(str(n), str(t)) for n in (1, 2) for t in range(1, STEPS + 1)]
 
 
 @pytest.mark.parametrize("when", ["training", "resetting"])
