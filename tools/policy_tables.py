@@ -125,7 +125,10 @@ def outside() -> str:
     today = curves([*read("outside/deadband.csv"), *read("outside/offset.csv")], method_in_gap, "gap and method")
     earlier = curves(read("outside/band.csv"), way, "gap, command map")
     first = curves(read("outside/sgft.csv"), method_in_gap, "gap and method")
-    return f"{first}\n\nWith two command maps, `offset` with suspicions too:\n\n{today}\n\nWhat led there:\n\n{earlier}"
+    told = curves(read("outside/failed_only.csv"), method_in_gap, "gap and method")
+    parts = [first, "With two command maps, `offset` with suspicions too:", today]
+    parts += ["Suspicions told by rollouts that failed alone:", told, "What led there:", earlier]
+    return "\n\n".join(parts)
 
 
 def audit() -> str:

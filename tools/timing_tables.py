@@ -26,7 +26,10 @@ def timing() -> str:
     parts += ["Updates with compiled networks:", pick(read("timing/time_compile.csv"), compiled)]
     pairs = {"what": "what", "size": "size", "precision": "precision", "before": "before", "before [ms]": "before_ms"}
     pairs |= {"now [ms]": "after_ms", "to the former": "ratio"}
-    parts += ["As configured, before and after:", pick(read("timing/time_commits.csv"), pairs)]
+    commits = [row for name in ("commits", "adapt") for row in read(f"timing/time_{name}.csv")]
+    parts += ["As configured, before and after:", pick(commits, pairs)]
+    maps = {"task": "task", "maps": "maps", "what": "what", "ms": "ms", "to none": "to_none"}
+    parts += ["What the maps of a deployment cost:", pick(read("timing/time_maps.csv"), maps)]
     profile = {name: name for name in ("size", "precision", "operation", "ms", "calls")}
     large = [row for row in read("timing/profile_update.csv") if float(row["share"]) >= 0.03]
     shares = pick(large, {**profile, "share": ("share", percent)})
