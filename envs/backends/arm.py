@@ -87,12 +87,12 @@ class Arm:
             ) from error
         mode = self.franky.RealtimeConfig.Enforce if self.realtime == "enforce" else self.franky.RealtimeConfig.Ignore
         found = within(self.timeout, lambda: self.franky.Robot(self.ip, realtime_config=mode), "robot", self.ip)
-        self.robot = found
         self._call(lambda: found.set_collision_behavior(*self.thresholds))
         mass, centre = self.load
         if mass:
             inertia = (mass * 0.05**2 * np.eye(3)).ravel().tolist()
             self._call(lambda: found.set_load(mass, [float(x) for x in centre], inertia))
+        self.robot = found  # only now: whoever tries again must set them again
 
     def read(self) -> ArmState:
         """The newest state; outside of a motion it is asked for, which takes a few milliseconds."""

@@ -47,6 +47,8 @@ class FrankaBackend:
         speed = rig.gate.limits.speed
         if not 0 < reset_speed <= speed / 1.1:
             raise ValueError(f"reset_speed={reset_speed}; it must be above 0 and at most {speed / 1.1:.2f} here")
+        if np.shape(safe_tip) != (3,) or not np.isfinite(safe_tip).all():
+            raise ValueError(f"safe_tip={safe_tip}; it must be three numbers: x, y and z in the base frame [m]")
         self.task, self.rig, self.gate = task, rig, rig.gate
         self.way = {
             "safe_tip": np.array(safe_tip, float),

@@ -43,6 +43,8 @@ class Limits:
             raise ValueError(f"joint_margin={self.joint_margin} rad leaves a joint no range")
         if not 0 < self.speed <= 1:
             raise ValueError(f"speed={self.speed}; it is a share of the joints' greatest speed, above 0, at most 1")
+        if not 0 <= self.body_height < np.inf:
+            raise ValueError(f"body_height={self.body_height} m; it must be 0 or more")
         for name in ("step", "state_age", "detection_age"):
             if not 0 < getattr(self, name) < np.inf:
                 raise ValueError(f"{name}={getattr(self, name)}; it must be above 0")

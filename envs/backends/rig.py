@@ -47,6 +47,8 @@ class Rig:
         patience: float,
         dry_run: bool,
     ):
+        if not isinstance(patience, int | float) or not 0 <= patience < np.inf:
+            raise ValueError(f"patience={patience}; it must be a number of seconds, 0 or more")
         self.arm, self.gate, self.patience, self.dry_run = arm, gate, patience, dry_run
         self.gripper = gripper
         self.clock = make_clock(clock, arm)

@@ -42,6 +42,7 @@ from mpc_sgft.storage.metrics import progress as bar_of
 
 AWAY = 10.0  # times the range of what was measured: no window of a motion leads there
 STEPS = (4 * SHARP, 2 * SHARP, SHARP)  # [s] to simulate with: the longest whose error noise hides
+APART = 0.05  # of a sample, by which two clocks may differ at the end of an episode
 UNSEEN, NOTHING = 0.2, 0.1  # share of the expected squared error that noise hides in a search, and in a judgement
 
 
@@ -64,13 +65,17 @@ def read(
     ]
     plant = driven(plant, recorded)
     axes, servos = plant.axes(), plant.servos()
-    found = [e for table in recorded for e in episodes(table, plant.actuators, axes, servos)]
-    steps = [e.dt for e in found]
+    each = [episodes(table, plant.actuators, axes, servos) for table in recorded]
+    steps = [e.dt for own in each for e in own]
     if max(steps) > 1.05 * min(steps):
         raise UserError(
             f"episodes have different sample times ({min(steps):g} to {max(steps):g} s); diagnose them apart."
         )
-    return plant, found
+    clock = each[0][0].dt
+    for i, (table, own) in enumerate(zip(recorded, each, strict=True)):
+        if max(abs(e.dt - clock) * len(e.ctrl) for e in own) > APART * clock:
+            each[i] = episodes(table, plant.actuators, axes, servos, clock)
+    return plant, [e for own in each for e in own]
 
 
 def run(

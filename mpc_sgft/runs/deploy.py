@@ -3,7 +3,7 @@
 import json
 import time
 from collections.abc import Callable
-from contextlib import closing
+from contextlib import closing, nullcontext
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -26,6 +26,7 @@ from mpc_sgft.runs.pretrain import StopRequest, Stopwatch, evaluation_seed
 from mpc_sgft.runs.real_rollout import begin, drive, start_seed
 from mpc_sgft.session import person
 from mpc_sgft.session.corrections import forget_audit
+from mpc_sgft.session.keyboard import ending_in_order
 from mpc_sgft.session.operator import Nobody, Operator
 from mpc_sgft.session.verdicts import Verdicts
 from mpc_sgft.storage import checkpoint, run_folder
@@ -41,7 +42,7 @@ def deploy(cfg: DictConfig) -> int:
     real, operator = cfg.backend.name == "franka", person.make_operator(cfg)
     env = robot.make_env(cfg, operator.place) if real else build.make_env(cfg, 1)
     build.check_fits(agent.model, env)
-    with operator, closing(env.backend):
+    with ending_in_order() if real else nullcontext(), operator, closing(env.backend):
         if real:
             robot.connect(env, operator)
         if real and cfg.backend.dry_run:
@@ -135,6 +136,8 @@ class Deployment:
         bar = progress(cfg.rollouts, initial=done, desc=f"deploy {cfg.chosen.method}", unit="rollout", disable=hidden)
         self.show_counts()
         while self.state["rollouts"] < cfg.rollouts:
+            if self.stop.asked:
+                raise Stopped(self.how_to_go_on())
             number = self.state["rollouts"] + 1
             with self.watch("rollout"):
                 rollout = self._rollout(number)
@@ -206,8 +209,8 @@ class Deployment:
         self.operator.enter("resetting", number - 1)
         try:
             state = begin(self.env, seed)
-        except BackendError:
-            self.verdicts.late(number - 1)
+        except BaseException:
+            self._break_off(number)
             raise
         if self.verdicts.again(number - 1):
             return None
@@ -224,9 +227,14 @@ class Deployment:
                 operator=self.operator,
                 state=state,
             )
-        except BaseException:  # a mark of the rollout before must not go with it
-            self.verdicts.late(number - 1)
+        except BaseException:
+            self._break_off(number)
             raise
+
+    def _break_off(self, number: int) -> None:
+        """Bring the machine to rest before a rollout is done, and keep what was said of the one before."""
+        self.env.backend.close()
+        self.verdicts.late(number - 1)
 
     def show_counts(self) -> None:
         """Tell the operator how the session stands."""

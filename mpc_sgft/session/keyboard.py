@@ -1,19 +1,23 @@
 """Single keys from a terminal, as they are pressed; the terminal is put back as it was, whatever ends the program."""
 
 import os
+import re
 import select
 import signal
 import sys
 import termios
 import threading
 import tty
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from types import FrameType, TracebackType
 from typing import Self
 
+ESCAPES = re.compile(rb"\x1b(?:\[[0-9;?]*[@-~]|O[A-Za-z])?")  # arrows and function keys: none of ours
+
 
 class Keyboard:
-    """Reads keys in a thread while the block runs. Ctrl-C stays what it is; SIGTERM ends the block in its order.
+    """Reads keys in a thread while the block runs. Ctrl-C stays what it is.
 
     Args:
         heard: Called in that thread with each character, and with "" once if the terminal is gone.
@@ -26,7 +30,6 @@ class Keyboard:
     def __enter__(self) -> Self:
         self._before = termios.tcgetattr(self.fd)
         self._wake_out, self._wake_in = os.pipe()
-        self._sigterm = signal.signal(signal.SIGTERM, _leave)
         tty.setcbreak(self.fd, termios.TCSADRAIN)
         self._thread = threading.Thread(target=self._run, name="keyboard", daemon=True)
         self._thread.start()
@@ -39,7 +42,6 @@ class Keyboard:
             os.write(self._wake_in, b"x")
             self._thread.join(2.0)
         finally:
-            signal.signal(signal.SIGTERM, self._sigterm)
             try:
                 termios.tcsetattr(self.fd, termios.TCSADRAIN, self._before)
             except termios.error:
@@ -56,9 +58,7 @@ class Keyboard:
                 data = os.read(self.fd, 64)
             except OSError:
                 data = b""
-            if data.startswith(b"\x1b"):  # an arrow or a function key: none of ours
-                continue
-            for character in data.decode(errors="ignore"):
+            for character in ESCAPES.sub(b"", data).decode(errors="ignore"):  # what came with an arrow counts
                 self.heard(character)
             if not data:
                 self.heard("")
@@ -70,6 +70,17 @@ def has_terminal() -> bool:
     if not (sys.stdin.isatty() and sys.stdout.isatty()):
         return False
     return os.tcgetpgrp(sys.stdin.fileno()) == os.getpgrp()
+
+
+@contextmanager
+def ending_in_order() -> Iterator[None]:
+    """A block that SIGTERM, or a terminal that hangs up, ends by `SystemExit`: an arm is stopped on the way out."""
+    before = {number: signal.signal(number, _leave) for number in (signal.SIGTERM, signal.SIGHUP)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def _leave(number: int, frame: FrameType | None) -> None:

@@ -1,6 +1,7 @@
 """Who watches a deployment: nobody, or a person at the keyboard (mpc_sgft/session/person.py)."""
 
 import sys
+import termios
 from collections.abc import Callable, Iterable
 from typing import Protocol, Self
 
@@ -99,7 +100,11 @@ class Nobody:
         """Nobody watches, but somebody may answer: a line, and Enter."""
         if not sys.stdin.isatty():
             raise BackendError("somebody must put the object in its place, and no terminal is attached to ask them")
-        input(f"\n{place_text(position)} ")
+        termios.tcflush(sys.stdin.fileno(), termios.TCIFLUSH)  # an Enter from before says nothing of now
+        try:
+            input(f"\n{place_text(position)} ")
+        except EOFError as error:
+            raise BackendError("nobody confirmed that the object is in its place") from error
 
     def enter(self, phase: str, episode: int) -> None:
         pass

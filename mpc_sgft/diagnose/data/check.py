@@ -32,7 +32,11 @@ def check_settings(window: float | None, seed: int, max_effects: int) -> None:
 
 
 def episodes(
-    table: Table, actuators: Sequence[str], joints: Mapping[str, Axis], servos: Mapping[str, str] | None = None
+    table: Table,
+    actuators: Sequence[str],
+    joints: Mapping[str, Axis],
+    servos: Mapping[str, str] | None = None,
+    clock: float | None = None,
 ) -> list[Episode]:
     """The uninterrupted pieces of one file.
 
@@ -41,6 +45,7 @@ def episodes(
         actuators: The model's actuators.
         joints: The model's hinges and slides.
         servos: Actuators whose command is where a joint shall be -> that joint.
+        clock: Sample time [s] to read it at; None: its own.
 
     Raises:
         UserError: If a column is missing or misnamed, time is not increasing, a number is not finite, units do not
@@ -72,12 +77,21 @@ def episodes(
         notes += (f"{table.name}: the commands are constant: what acts on commands cannot show here",)
     cuts = np.flatnonzero(steps > GAP * dt) + 1
     pieces = [p for p in np.split(np.arange(len(time)), cuts) if len(p) >= MIN_SAMPLES]
+    if not pieces:
+        raise UserError(
+            f"{table.name}: {len(cuts)} pauses in the recording, and no piece between them has {MIN_SAMPLES} samples. "
+            "Record without pauses, or leave it out."
+        )
     if len(cuts):
-        notes += (f"{table.name}: {len(cuts)} pauses in the recording; read as {len(pieces)} episodes",)
+        lost = len(time) - sum(map(len, pieces))
+        short = f"; {lost} samples in pieces shorter than {MIN_SAMPLES} were left out" if lost else ""
+        notes += (f"{table.name}: {len(cuts)} pauses in the recording; read as {len(pieces)} episodes{short}",)
+    if clock is not None:
+        notes += (f"{table.name}: read at a sample every {clock:g} s, as the first recording has",)
     built = []
     for k, rows in enumerate(pieces):
         name = table.name if len(pieces) == 1 else f"{table.name}#{k}"
-        built.append(_even(name, columns, rows, dt, actuators, list(joints), notes if k == 0 else ()))
+        built.append(_even(name, columns, rows, dt, clock, actuators, list(joints), notes if k == 0 else ()))
     return built
 
 
@@ -126,6 +140,7 @@ def _even(
     columns: dict[str, Array],
     rows: Index,
     dt: float,
+    clock: float | None,
     actuators: Sequence[str],
     joints: Sequence[str],
     notes: tuple[str, ...],
@@ -134,12 +149,15 @@ def _even(
 
     Stamps that scatter around an even clock by less than half a sample are taken for scattered readings of a controller
     that ticks evenly: the command of a row acts from its tick on, and a force that was read before shows the command
-    before. Otherwise commands act from the row's own time on, and nobody knows which of two a force shows.
+    before. Otherwise, and on another clock, commands act from the row's own time on, and nobody knows which of two a
+    force shows.
     """
     time = columns["time"][rows]
     ticks = np.concatenate([[0], np.cumsum(np.maximum(1, np.round(np.diff(time) / dt)))])
     even_dt, first = _line(ticks, time)
     ticking = bool(np.abs(time - first - even_dt * ticks).max() < 0.5 * even_dt)
+    if clock is not None:
+        ticking, dt = False, clock
     if ticking:
         even, late = first + even_dt * np.arange(int(ticks[-1]) + 1), even_dt / 2
     else:

@@ -44,10 +44,10 @@ UNITS = {
 FORM = "[FACTOR*]COLUMN[ UNIT][ + OFFSET]"
 KINDS = ("time", "ctrl/", "qpos/", "qvel/", "force/", "sensor/")
 PATTERN = re.compile(
-    r"""^\s*(?:(?P<factor>[-+]?[\d.]+(?:[eE][-+]?\d+)?)\s*\*\s*|(?P<minus>-))?
+    r"""^\s*(?:(?P<factor>[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*\*\s*|(?P<minus>-))?
     (?P<column>.+?)
     (?:\s+(?P<unit>[A-Za-z]+(?:/s)?))?
-    (?:\s+(?P<sign>[-+])\s+(?P<offset>[\d.]+(?:[eE][-+]?\d+)?))?\s*$""",
+    (?:\s+(?P<sign>[-+])\s+(?P<offset>(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?))?\s*$""",
     re.VERBOSE,
 )
 

@@ -126,9 +126,12 @@ def _read_parquet(path: Path) -> dict[str, Array]:
 
     try:
         table = pyarrow.parquet.read_table(path)
-        return {name: np.asarray(table[name].to_numpy(), float) for name in table.column_names}
-    except (ArrowException, ValueError) as error:
+        columns = {name: np.asarray(table[name].to_numpy(), float) for name in table.column_names}
+    except (ArrowException, ValueError, TypeError) as error:
         raise UserError(f"{path}: cannot be read as Parquet with numeric columns ({error}).") from error
+    if not table.num_rows or not columns:
+        raise UserError(f"{path}: empty. A Parquet episode has one row per sample.")
+    return columns
 
 
 def _read_mcap(path: Path) -> Table:

@@ -195,7 +195,7 @@ def split(replayer: Any, held_out: float | Sequence[str] | None) -> tuple[Index,
         wrong = [n for n in held_out if n not in names]
         if wrong:
             raise UserError(f"held-out episode {wrong[0]!r} is not in the data. There are: {', '.join(names)}.")
-        apart = np.isin(w.episode, [names.index(n) for n in held_out])
+        apart = np.isin(np.array(names)[w.episode], list(held_out))
     else:
         share = 0.25 if held_out is None else float(held_out)
         if not 0 < share < 1:

@@ -20,6 +20,7 @@ from mpc_sgft.diagnose.simulation.urdf import is_urdf, read_urdf
 SHARP = 5e-4  # [s] longest step of a fit that is judged
 FORCE = "diagnose/force/"  # sensors that are added for the comparison
 SCALAR = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
+KEEPING = [int(getattr(mujoco.mjtDyn, f"mjDYN_{name}")) for name in ("INTEGRATOR", "MUSCLE", "USER")]
 
 
 @dataclass(frozen=True)
@@ -109,6 +110,13 @@ class Plant:
         if any(t not in SCALAR for t in self.model.jnt_type):
             free = [self.model.joint(i).name for i in range(self.model.njnt) if self.model.jnt_type[i] not in SCALAR]
             raise UserError(f"joint {free[0]!r} is free or a ball: only hinges and slides can be compared with --data.")
+        keeping = np.flatnonzero(np.isin(self.model.actuator_dyntype, KEEPING))
+        if len(keeping):
+            raise UserError(
+                f"actuator {self.model.actuator(int(keeping[0])).name!r} keeps an activation that a recording "
+                "does not tell (dyntype integrator, muscle or user). Describe what it does at once: for intvelocity a "
+                "position servo, with the commands integrated."
+            )
         self.joints = [self.model.joint(i).name for i in range(self.model.njnt)]
         self.actuators = [self.model.actuator(i).name for i in range(self.model.nu)]
 

@@ -1,7 +1,9 @@
 """The real client against a controller that speaks the robot's protocol: it moves as told, and no further."""
 
 import time
+from collections.abc import Callable
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,8 +11,10 @@ import pytest
 from envs.backends.arm import Arm
 from envs.backends.base import BackendError
 from envs.backends.franka import FrankaBackend
+from envs.backends.rig import Rig
 from envs.backends.safety import NotSafe
 from envs.stand_in.client import StandIn
+from envs.tasks.push import Push
 
 RIGHT = np.array([[0.0, 0.5]])
 
@@ -78,3 +82,35 @@ def test_nobody_at_the_address(robot_config: dict) -> None:
     with pytest.raises(BackendError, match="no robot answers at 127.77.77.77"):
         Arm("127.77.77.77", **robot_config["arm"]).connect()
     assert time.monotonic() - began < 5
+
+
+def test_a_connection_that_did_not_finish_counts_for_nothing(
+    stand_in: StandIn, robot_config: dict, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whoever tries again must set contact thresholds and load again."""
+    calls, whole = [], Arm._call
+
+    def broken(arm: Arm, do: Callable[[], Any]) -> Any:
+        calls.append(do)
+        if len(calls) == 2:
+            raise BackendError("the line is dead")
+        return whole(arm, do)
+
+    monkeypatch.setattr(Arm, "_call", broken)
+    arm = Arm(stand_in.ip, **{**robot_config["arm"], "timeout": 30})
+    with pytest.raises(BackendError, match="the line is dead"):
+        arm.connect()
+    assert len(calls) == 2 and arm.robot is None
+
+
+@pytest.mark.parametrize("patience", [None, -1.0, float("inf")])
+def test_patience_is_a_number_of_seconds(patience: float | None) -> None:
+    with pytest.raises(ValueError, match="patience=.*a number of seconds, 0 or more"):
+        Rig(None, None, None, gripper=None, clock="robot", patience=patience, dry_run=False)  # type: ignore
+
+
+@pytest.mark.parametrize("tip", [[0.4, 0.0], [0.4, 0.0, float("nan")], 0.4])
+def test_the_safe_tip_is_a_place(tip: Any, robot_push: Push) -> None:
+    rig = SimpleNamespace(gate=SimpleNamespace(limits=SimpleNamespace(speed=1.0)))
+    with pytest.raises(ValueError, match="safe_tip=.*three numbers"):
+        FrankaBackend(robot_push, rig, safe_tip=tip, reset_speed=0.1)  # type: ignore

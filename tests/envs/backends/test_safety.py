@@ -132,6 +132,8 @@ def test_a_route_is_taken_whole_or_not_at_all() -> None:
         ({"speed": 0.0}, "speed"),
         ({"step": -1.0}, "step"),
         ({"retries": -1}, "retries"),
+        ({"body_height": -1.0}, "body_height"),
+        ({"body_height": float("nan")}, "body_height"),
     ],
 )
 def test_limits_that_make_no_sense_are_refused(change: dict, words: str) -> None:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
+import mujoco
 import numpy as np
 import pytest
 
@@ -14,6 +16,8 @@ from mpc_sgft.diagnose.data.check import episodes
 from mpc_sgft.diagnose.data.measured import Table, read_table, write_csv
 from mpc_sgft.diagnose.data.sources import sources
 from mpc_sgft.diagnose.data.units import Axis
+from mpc_sgft.diagnose.fitting.prepare import split
+from mpc_sgft.diagnose.run import read
 from mpc_sgft.diagnose.simulation.plant import load_plant
 
 CHIRP = np.sin(1e-3 * np.arange(209) ** 2)
@@ -88,6 +92,51 @@ def test_a_pause_splits_the_recording() -> None:
     time = np.r_[np.arange(100) * 0.01, 5 + np.arange(100) * 0.01]
     first, second = episodes(_table(time=time), ["motor"], RANGES)
     assert len(first.ctrl) == len(second.ctrl) == 100 and "1 pauses" in first.notes[0]
+
+
+def test_a_recording_of_pauses_alone_is_refused_and_what_is_lost_is_told() -> None:
+    time = (np.arange(200) + 10 * (np.arange(200) // 40)) * 0.01
+    with pytest.raises(UserError, match="run1: 4 pauses in the recording, and no piece between them has 50 samples"):
+        episodes(_table(time=time), ["motor"], RANGES)
+    long = (np.arange(200) + 10 * (np.arange(200) >= 160)) * 0.01
+    (episode,) = episodes(_table(time=long), ["motor"], RANGES)
+    assert "read as 1 episodes; 40 samples in pieces shorter than 50 were left out" in episode.notes[0]
+
+
+def test_all_recordings_are_read_on_one_clock(tmp_path: Path) -> None:
+    """The second one's samples come 0.4 % later: twelve samples at its end, where its commands must not be early."""
+    scene = tmp_path / "scene.xml"
+    scene.write_text(
+        '<mujoco><worldbody><body><joint name="x" type="slide"/><geom size=".1"/></body></worldbody>'
+        '<actuator><motor name="motor" joint="x"/></actuator></mujoco>'
+    )
+    for name, dt in (("a", 0.01), ("b", 0.01004)):
+        t = np.arange(3000) * dt
+        write_csv(tmp_path / f"{name}.csv", {"time": t, "ctrl/motor": np.sign(np.sin(t)), "qpos/x": 0.1 * np.cos(t)})
+    _, (first, second) = read(load_plant(scene), [tmp_path / "a.csv", tmp_path / "b.csv"])
+    assert first.dt == pytest.approx(second.dt, rel=1e-9) and not first.notes
+    assert "b: read at a sample every 0.01 s" in second.notes[0]
+    t = np.arange(len(second.ctrl)) * second.dt
+    assert len(t) == 3011
+    np.testing.assert_allclose(second.signals["qpos/x"], 0.1 * np.cos(t), atol=1e-7)
+    assert (second.ctrl[:, 0] != np.sign(np.sin(t))).sum() <= 10, "a sample late at each of the reversals at most"
+
+
+def test_what_keeps_an_activation_is_refused() -> None:
+    with pytest.raises(UserError, match="actuator 'v' keeps an activation that a recording does not tell"):
+        load_plant(
+            mujoco.MjSpec.from_string(
+                '<mujoco><worldbody><body><joint name="x" type="slide"/><geom size=".1"/></body></worldbody>'
+                '<actuator><intvelocity name="v" joint="x" kp="50" actrange="-1 1"/></actuator></mujoco>'
+            )
+        )
+
+
+def test_every_recording_of_a_name_is_held_out() -> None:
+    recorded = [SimpleNamespace(name=name) for name in ("ep0", "ep1", "ep0")]
+    windows = SimpleNamespace(episode=np.repeat([0, 1, 2], 4), start=np.arange(12))
+    fitted, held = split(SimpleNamespace(windows=windows, episodes=recorded), ["ep0"])
+    assert fitted.tolist() == [4, 5, 6, 7] and len(held) == 8
 
 
 def test_scattered_stamps_do_not_move_the_commands() -> None:

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import signal
 from pathlib import Path
 
 import pytest
@@ -10,7 +11,7 @@ from omegaconf import DictConfig
 from safetensors.torch import load_file
 
 from mpc_sgft.command import compose
-from mpc_sgft.command.errors import UserError
+from mpc_sgft.command.errors import Stopped, UserError
 from mpc_sgft.learning.transfer import Transfer
 from mpc_sgft.runs import build, deploy
 from mpc_sgft.session.corrections import amend
@@ -155,6 +156,23 @@ def test_what_a_rollout_that_breaks_down_leaves_behind(tmp_path, monkeypatch):
     go_on(tmp_path / "r", None)
     audited = [(row["rollout"], row["step"]) for row in rows(tmp_path / "r", "audit.csv")]
     assert audited == [(str(n), str(t)) for n in (1, 2) for t in range(1, STEPS + 1)]
+
+
+@pytest.mark.parametrize("key", ["rerecord", None])
+def test_after_ctrl_c_no_other_rollout_begins(tmp_path, monkeypatch, key):
+    """Not either where the one that is running is to be driven again."""
+    driven, drive = [], deploy.drive
+
+    def stopped(*args, number: int, **more):
+        driven.append(number)
+        found = drive(*args, number=number, **more)
+        signal.raise_signal(signal.SIGINT)
+        return found
+
+    monkeypatch.setattr(deploy, "drive", stopped)
+    with pytest.raises(Stopped, match=f"saved after {0 if key else 1} rollouts"):
+        run(tmp_path / "r", Script({("running", 1): [key]} if key else {}))
+    assert driven == [1]
 
 
 @pytest.mark.parametrize("when", ["training", "resetting"])
