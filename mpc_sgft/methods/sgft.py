@@ -142,7 +142,7 @@ class SGFT(AbstractMethod):
             policy_lr=self.policy_lr,
             command_lr=self.command_lr,
             observation_lr=self.observation_lr,
-            following=("dynamics.band_acts", "dynamics.joint_acts"),
+            following=("dynamics.band_acts", "dynamics.joint_acts") if self.residual else (),  # else of the dynamics
         )
         self._sensed = sensed
         self._pretrained = [p.detach().clone() for p in agent.dynamics_parameters()]
