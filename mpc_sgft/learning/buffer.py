@@ -108,7 +108,7 @@ class SliceSampler(Sampler):
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         for name in ROWS:
             rows, saved = getattr(self, name), state_dict[name]
-            rows[: len(saved)] = saved[: len(rows)]
+            rows[: len(saved)] = saved[: len(rows)]  # the others are those of an empty buffer
         self.tails = {e: (row, step) for e, row, step in state_dict["tails"].tolist()}
         self.generator.set_state(state_dict["generator"].cpu())
         self._starts = None

@@ -132,18 +132,16 @@ class Transfer:
         gate, before = self.method.gate or WITHOUT_GATE, self.verdicts[1:]
 
         def choose(
-            set_acting: Callable[[WorldModel, bool], object],
-            acted: Choice | None,
-            told: list[Choice | None],
-            margin: float,
-            tells: bool = True,
+            set_acting: Callable[[WorldModel, bool], object], name: str, margin: float, *, by_failures: bool = False
         ) -> Choice:
-            errors, acts = [], bool(acted and acted.rival_acts)
+            told = [getattr(v, name) for v in before if not (by_failures and v.success)]
+            last = getattr(before[-1], name) if before else None
+            errors, acts = [], bool(last and last.rival_acts)
             for rival in (False, True):
                 set_acting(simulator, rival)
                 errors.append(error(simulator))
             choice = Choice(errors[0], errors[1], acts)
-            if self.verdicts and tells:
+            if self.verdicts and not (by_failures and success):
                 pairs = [(c.rival, c.plain) for c in [*told, choice] if c][-gate.memory :]
                 choice = choice._replace(rival_acts=begins(pairs, acts, margin))
             for model in (simulator, self.agent.model, self.averaged.model):
@@ -152,14 +150,9 @@ class Transfer:
 
         if margin:
             simulator.suspect(False)  # until it is chosen
-        last = before[-1] if before else None
-        band = suspicion = None
-        if has_band:
-            band = choose(WorldModel.use_band, last and last.band, [v.band for v in before], gate.margin)
+        band = choose(WorldModel.use_band, "band", gate.margin) if has_band else None
         mapped = band.plain if band else error(simulator)
-        if margin:
-            failed = [v.suspicion for v in before if not v.success]
-            suspicion = choose(WorldModel.suspect, last and last.suspicion, failed, margin, tells=not success)
+        suspicion = choose(WorldModel.suspect, "suspicion", margin, by_failures=True) if margin else None
         return mapped, band, suspicion
 
     def _error_in_simulation(self) -> float:

@@ -233,8 +233,10 @@ class Deployment:
 
     def _break_off(self, number: int) -> None:
         """Bring the machine to rest before a rollout is done, and keep what was said of the one before."""
-        self.env.backend.close()
-        self.verdicts.late(number - 1)
+        try:
+            self.env.backend.close()
+        finally:
+            self.verdicts.late(number - 1)
 
     def show_counts(self) -> None:
         """Tell the operator how the session stands."""

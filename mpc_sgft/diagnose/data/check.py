@@ -149,22 +149,22 @@ def _even(
 
     Stamps that scatter around an even clock by less than half a sample are taken for scattered readings of a controller
     that ticks evenly: the command of a row acts from its tick on, and a force that was read before shows the command
-    before. Otherwise, and on another clock, commands act from the row's own time on, and nobody knows which of two a
+    before. Otherwise commands act from the row's own time on. Then, and on another clock, nobody knows which of two a
     force shows.
     """
     time = columns["time"][rows]
     ticks = np.concatenate([[0], np.cumsum(np.maximum(1, np.round(np.diff(time) / dt)))])
     even_dt, first = _line(ticks, time)
     ticking = bool(np.abs(time - first - even_dt * ticks).max() < 0.5 * even_dt)
-    if clock is not None:
-        ticking, dt = False, clock
+    came = first + even_dt * ticks if ticking and clock is not None else time  # from when on commands act
+    ticking = ticking and clock is None
     if ticking:
         even, late = first + even_dt * np.arange(int(ticks[-1]) + 1), even_dt / 2
     else:
-        even_dt, late = dt, 1e-9
-        even = time[0] + dt * np.arange(int((time[-1] - time[0]) / dt + 1e-6) + 1)
+        even_dt, late = clock or dt, 1e-9
+        even = came[0] + even_dt * np.arange(int((came[-1] - came[0]) / even_dt + 1e-6) + 1)
     jitter = len(even) != len(time) or bool(np.abs(time - even).max() > JITTER * dt)
-    held = np.clip(np.searchsorted(time, even + late, side="right") - 1, 0, len(time) - 1)
+    held = np.clip(np.searchsorted(came, even + late, side="right") - 1, 0, len(time) - 1)
     off = time[held] - even
     own = np.abs(off) < late  # ticks with a row of their own
     off_tick = np.where(own & ticking, np.where(np.abs(off) > JITTER * dt, off, 0.0), np.nan)

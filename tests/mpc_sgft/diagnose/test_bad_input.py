@@ -139,6 +139,19 @@ def test_every_recording_of_a_name_is_held_out() -> None:
     assert fitted.tolist() == [4, 5, 6, 7] and len(held) == 8
 
 
+def test_parquet_that_is_no_table_of_numbers_is_one_line(tmp_path: Path) -> None:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    for name, table, says in (
+        ("nested", pa.table({"time": [{"s": 1}]}), "cannot be read as Parquet with numeric columns"),
+        ("none", pa.table({"time": pa.array([], pa.float64())}), "empty. A Parquet episode has one row per sample"),
+    ):
+        pq.write_table(table, tmp_path / f"{name}.parquet")
+        with pytest.raises(UserError, match=says):
+            read_table(tmp_path / f"{name}.parquet")
+
+
 def test_scattered_stamps_do_not_move_the_commands() -> None:
     rng, ticks = np.random.default_rng(0), np.arange(2000) * 0.01
     time, ctrl = ticks + rng.uniform(-0.002, 0.002, 2000), rng.normal(size=2000)
@@ -146,6 +159,8 @@ def test_scattered_stamps_do_not_move_the_commands() -> None:
     (episode,) = episodes(table, ["motor"], RANGES)
     assert abs(episode.dt - 0.01) < 1e-6
     np.testing.assert_array_equal(episode.ctrl[:, 0], ctrl)
+    (again,) = episodes(table, ["motor"], RANGES, clock=episode.dt)
+    assert (again.ctrl[:1999, 0] == ctrl[:1999]).mean() > 0.999, "nor on a clock that is given"
     np.testing.assert_allclose(episode.signals["qpos/x"], np.sin(ticks), atol=3e-4)  # the stamps are off by up to 2e-3
 
 

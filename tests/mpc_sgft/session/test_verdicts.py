@@ -10,6 +10,7 @@ import torch
 from omegaconf import DictConfig
 from safetensors.torch import load_file
 
+from envs.backends.base import BackendError
 from mpc_sgft.command import compose
 from mpc_sgft.command.errors import Stopped, UserError
 from mpc_sgft.learning.transfer import Transfer
@@ -156,6 +157,26 @@ def test_what_a_rollout_that_breaks_down_leaves_behind(tmp_path, monkeypatch):
     go_on(tmp_path / "r", None)
     audited = [(row["rollout"], row["step"]) for row in rows(tmp_path / "r", "audit.csv")]
     assert audited == [(str(n), str(t)) for n in (1, 2) for t in range(1, STEPS + 1)]
+
+
+@pytest.mark.parametrize("error", [BackendError, KeyboardInterrupt, SystemExit])
+def test_a_mark_during_a_reset_is_kept_and_the_machine_at_rest(tmp_path, monkeypatch, error):
+    order, begin, late = [], deploy.begin, deploy.Verdicts.late
+
+    def broken(env, seed):
+        if order:
+            env.backend.close = lambda: order.append("closed")
+            raise error
+        order.append("first")
+        return begin(env, seed)
+
+    monkeypatch.setattr(deploy, "begin", broken)
+    monkeypatch.setattr(deploy.Verdicts, "late", lambda self, n: (order.append(n), late(self, n))[1])
+    with pytest.raises(error):
+        run(tmp_path / "r", Script({("resetting", 1): ["success"]}))
+    assert order[-2:] == ["closed", 1]
+    assert read_episode(tmp_path / "r" / "episodes" / "0001.mcap").outcome["success"] is True
+    assert learned(tmp_path / "r") == [(1, True)]
 
 
 @pytest.mark.parametrize("key", ["rerecord", None])

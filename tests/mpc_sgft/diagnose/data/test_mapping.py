@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -65,3 +66,10 @@ def test_a_column_that_is_not_there_is_told_with_the_nearest() -> None:
     table = Table("run", {"time": np.zeros(2), "encoder": np.zeros(2)})
     with pytest.raises(UserError, match="no column 'encodr'. Is it 'encoder'"):
         mapped(table, parse_mapping({"qpos/a": "encodr deg"}))
+
+
+@pytest.mark.parametrize("source", ["1.2.3*x", ".*x", "x + 1.2.3"])
+def test_what_is_no_number_belongs_to_the_name(source: str) -> None:
+    table = Table("run", {"time": np.zeros(2), "x": np.zeros(2)})
+    with pytest.raises(UserError, match=re.escape(f"no column '{source}'")):
+        mapped(table, parse_mapping({"qpos/a": source}))
