@@ -35,7 +35,7 @@ from mpc_sgft.diagnose.verdict import repair
 from mpc_sgft.diagnose.verdict.naming import choose as choose_set
 from mpc_sgft.diagnose.verdict.naming import settled
 from mpc_sgft.diagnose.verdict.relevance import repairs
-from mpc_sgft.diagnose.verdict.tolerance import Predict, Tolerance, limits_of
+from mpc_sgft.diagnose.verdict.tolerance import Predict, Tolerance, limits_of, spread_of
 from mpc_sgft.diagnose.verdict.verdict import Verdict, reach_verdict
 from mpc_sgft.storage.metrics import progress as bar_of
 
@@ -161,9 +161,9 @@ def tolerance_of(setup: Setup[Chain], tolerance: float | Mapping[str, float | st
     """Prediction errors of the observations and of the control that reaches the servos that may not matter."""
     chain, names = setup.problem, signal_names(setup.problem)
     measured = seen(chain.observed, chain.drive)
-    spread = measured.reshape(-1, len(names)).std(0)
-    limits = limits_of(tolerance, names, [UNITS[n.split("/")[0]] for n in names], spread)
-    return Tolerance(limits, _predict(chain), measured, setup.noise[: len(names)], tolerance is not None)
+    predict, units = _predict(chain), [UNITS[n.split("/")[0]] for n in names]
+    limits = limits_of(tolerance, names, units, spread_of(measured, predict([setup.baseline])[0], units))
+    return Tolerance(limits, predict, measured, setup.noise[: len(names)], tolerance is not None)
 
 
 def _predict(chain: Chain) -> Predict:

@@ -36,7 +36,7 @@ from mpc_sgft.diagnose.verdict.naming import choose as choose_set
 from mpc_sgft.diagnose.verdict.naming import settled
 from mpc_sgft.diagnose.verdict.next_experiment import next_experiment
 from mpc_sgft.diagnose.verdict.relevance import repairs
-from mpc_sgft.diagnose.verdict.tolerance import Predict, Tolerance, limits_of
+from mpc_sgft.diagnose.verdict.tolerance import Predict, Tolerance, limits_of, spread_of
 from mpc_sgft.diagnose.verdict.verdict import Verdict, reach_verdict
 from mpc_sgft.storage.metrics import progress as bar_of
 
@@ -160,9 +160,9 @@ def tolerance_of(setup: Setup[Problem], tolerance: float | Mapping[str, float | 
     """Prediction errors of the compared signals that may not matter."""
     replayer = setup.problem.replayer
     measured, signals = replayer.windows.measured, replayer.signals
-    spread = measured.reshape(-1, len(signals)).std(0)
-    limits = limits_of(tolerance, signals, [_unit(replayer.plant, n) for n in signals], spread)
-    return Tolerance(limits, _predict(replayer), measured, setup.noise, tolerance is not None)
+    predict, units = _predict(replayer), [_unit(replayer.plant, n) for n in signals]
+    limits = limits_of(tolerance, signals, units, spread_of(measured, predict([setup.baseline])[0], units))
+    return Tolerance(limits, predict, measured, setup.noise, tolerance is not None)
 
 
 def _predict(replayer: Replayer) -> Predict:

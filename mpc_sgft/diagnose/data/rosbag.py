@@ -1,7 +1,7 @@
 """ROS 2 bags: a folder with metadata.yaml, or one .mcap or .db3 file. The clock is that of a JointState topic.
 
-Commands are held until the next one, and taken up at the next sample of that clock. Times are those of the headers
-where all have one, else those at which messages were recorded.
+Commands are held until the next one, and taken up at the next sample of that clock. Times of a topic are those of the
+headers where all its messages have one, else those at which they were recorded; the latter for all if clocks are apart.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from mpc_sgft.diagnose.data.measured import Array, Offer, Table
 from mpc_sgft.diagnose.data.ros_messages import READ, STATE, Stream, says_command, take
 
 NEEDS = "ROS 2 bags need the package rosbags: pip install 'mpc_sgft[ros]'."
-APART = 1e9  # [ns] by which headers and the recorder may differ and still be one clock
+APART = 1e9  # [ns] by which clocks may differ, and still be one
 MAGIC = b"\x89MCAP0\r\n"
 
 
@@ -128,15 +128,17 @@ def table_of(bag: Bag, used: Iterable[str] = (), joints: Sequence[str] = ()) -> 
 
 
 def _which_time(bag: Bag) -> tuple[bool, list[str]]:
-    """Whether the recorder's clock is needed because headers and it are apart, and what to say of it."""
-    away = [s for s in bag.streams if s.stamped and abs(np.median(np.array(s.logs) - np.array(s.stamps))) > APART]
-    bare = [s for s in bag.streams if s.commands and not s.stamped]
-    if away and bare:
-        return True, [
-            f"headers of {away[0].topic} are on another clock than the recorder, and {bare[0].topic} has none: all "
-            "times are those of the recorder"
-        ]
-    return False, []
+    """Whether the recorder's clock is needed because the topics' own clocks are apart, and what to say of it."""
+    late = [
+        float(np.median(s.clock(True) - s.clock(False))) for s in bag.streams
+    ]  # [ns] from its own to the recorder's
+    first, last = (bag.streams[i].topic for i in (int(np.argmin(late)), int(np.argmax(late))))
+    if max(late) - min(late) <= APART:
+        return False, []
+    return True, [
+        f"{first} and {last} are {1e-9 * (max(late) - min(late)):.3g} s apart by their own clocks (headers where all "
+        "messages have one, else the recorder's): all times are those of the recorder"
+    ]
 
 
 def _clock(bag: Bag, used: set[str], joints: Sequence[str]) -> Stream:

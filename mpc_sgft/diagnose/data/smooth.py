@@ -43,11 +43,16 @@ def noise_of(x: Array) -> float:
     """
     difference = np.diff(x, 4)
     plain = float(np.median(np.abs(difference))) / 0.6745 / np.sqrt(70.0)
+    return max(plain, quantum(x) / np.sqrt(12.0), 1e-12 * float(np.ptp(x)), 1e-15)
+
+
+def quantum(x: Array) -> float:
+    """The step of a signal [T] all of whose steps are multiples of one; 0 if they are not."""
     steps = np.abs(np.diff(x))
     moving = steps[steps > 0]
-    if len(moving) and np.median(np.abs(moving / moving.min() - np.round(moving / moving.min()))) < 1e-3:
-        plain = max(plain, float(moving.min()) / np.sqrt(12.0))
-    return max(plain, 1e-12 * float(np.ptp(x)), 1e-15)
+    if not len(moving) or np.median(np.abs(moving / moving.min() - np.round(moving / moving.min()))) >= 1e-3:
+        return 0.0
+    return float(moving.min())
 
 
 def smooth(episode: Episode, joints: Sequence[str]) -> Smooth:

@@ -13,7 +13,7 @@ from mpc_sgft.command.errors import UserError
 from mpc_sgft.diagnose.candidates.effect_table import TypicalSizes
 from mpc_sgft.diagnose.candidates.library import Term
 from mpc_sgft.diagnose.data.measured import Array, Episode, Index
-from mpc_sgft.diagnose.data.smooth import noise_of, smooth
+from mpc_sgft.diagnose.data.smooth import noise_of, quantum, smooth
 from mpc_sgft.diagnose.data.windows import AFTER, BEFORE, EITHER
 from mpc_sgft.diagnose.fitting.fit import Discrepancy, Fit, Problem, Residuals, by_parts, change_of, fit
 from mpc_sgft.diagnose.simulation.plant import Plant, joint_of
@@ -130,14 +130,28 @@ def prepare(
     if len(replayer.windows.start) < 4:
         raise UserError(f"only {len(replayer.windows.start)} windows: give more data or a shorter --window.")
     fitted, held = split(replayer, held_out)
-    noise = np.array([np.median([noise_of(e.signals[s]) for e in episodes]) for s in chosen])
+    noise = typical(noise_of, episodes, chosen)
     shape = replayer.windows.measured.shape
     nothing = np.zeros(shape)
     first = _problem(replayer, noise, Discrepancy(nothing, np.zeros((0, *shape)), nothing), [], [])
     base = fit(first, nominal, [t.neutral for t in nominal], fitted)
     missed = replayer.windows.measured - replayer.simulate([change_of(nominal, base.values)])[0]
     noise = np.minimum(noise, [np.median([noise_of(x) for x in missed[..., i]]) for i in range(len(chosen))])
+    encoder = typical(quantum, episodes, chosen) / np.sqrt(12.0)  # hides in what is missed: it rests between two steps
+    noise = np.where([s.startswith("qpos/") for s in chosen], np.maximum(noise, encoder), noise)  # a force may jump
     return _setup(replayer, noise, fitted, held, base, nominal)
+
+
+def typical(measure: Callable[[Array], float], episodes: Sequence[Episode], signals: Sequence[str]) -> Array:
+    """The median over the episodes in which a signal changes, [S]; where it never does, the least of its kind."""
+    told = {s: [measure(e.signals[s]) for e in episodes if np.ptp(e.signals[s]) > 0] for s in signals}
+    kinds = {
+        s: [float(np.median(x)) for t, x in told.items() if x and t.split("/")[0] == s.split("/")[0]] for s in told
+    }
+    still = [measure(episodes[0].signals[s]) for s in signals]
+    return np.array(
+        [np.median(told[s]) if told[s] else min(kinds[s], default=x) for s, x in zip(signals, still, strict=True)]
+    )
 
 
 def near_fit(setup: Setup[Problem], f: Fit, plant: Plant) -> Setup[Problem]:

@@ -62,7 +62,26 @@ class Tolerance:
         """
         y = self.predict(fits)
         apart = np.einsum("w,kwns->ks", told, (y[1:] - y[:1]) ** 2) / y[0, ..., 0].size
-        return np.sqrt((apart / self.limits**2).max(-1))
+        alike = np.zeros_like(apart)  # also where nothing is tolerated
+        return np.sqrt(np.divide(apart, self.limits**2, out=alike, where=apart > 0).max(-1))
+
+
+def spread_of(measured: Array, predicted: Array, units: Sequence[str]) -> Array:
+    """How far signals move, [S]: standard deviations.
+
+    One that stands still has the least of those of its unit that move; if that is less, or there is none, that of what
+    the nominal model says.
+
+    Args:
+        measured, predicted: [W, n, S].
+        units: Of the signals.
+    """
+    spread, foretold = (x.reshape(-1, len(units)).std(0) for x in (measured, predicted))
+    moves, unit_of = np.ptp(measured, axis=(0, 1)) > 0, np.array(units)
+    for i in np.flatnonzero(~moves).tolist():
+        others = spread[moves & (unit_of == units[i])]
+        spread[i] = max(foretold[i], others.min() if len(others) else 0.0)
+    return spread
 
 
 def parse_tolerance(text: str) -> float | dict[str, str]:

@@ -18,7 +18,7 @@ from mpc_sgft.diagnose.__main__ import main
 from mpc_sgft.diagnose.data.measured import Array
 from mpc_sgft.diagnose.fitting.hypothesis import Hypothesis
 from mpc_sgft.diagnose.verdict.relevance import Repairs, repairs
-from mpc_sgft.diagnose.verdict.tolerance import limits_of, parse_tolerance
+from mpc_sgft.diagnose.verdict.tolerance import Tolerance, limits_of, parse_tolerance, spread_of
 
 FEW = ["viscous_friction", "coulomb_friction", "quadratic_drag", "actuator_offset"]
 Record = Callable[..., Path]
@@ -120,6 +120,22 @@ def test_tolerances_have_units_of_their_signals() -> None:
     assert limits_of(parse_tolerance("qpos/a=0.5mm"), signals, units, spread) == pytest.approx([5e-4, np.inf])
     both = limits_of(parse_tolerance("qpos/b=0.1deg, qpos/a=3"), signals, units, spread)
     assert both == pytest.approx([3.0, 0.1 * np.pi / 180])
+
+
+def test_a_signal_that_stands_still_is_tolerated_as_those_that_move() -> None:
+    units, t = ["m", "m", "rad"], np.linspace(0, 1, 101)
+    measured = np.stack([t, 0 * t, 0 * t], -1)[None]
+    falls = np.stack([t, 0 * t, 2 * t], -1)[None]
+    assert spread_of(measured, falls, units) == pytest.approx([t.std(), t.std(), 2 * t.std()])
+    assert spread_of(measured, measured, units) == pytest.approx([t.std(), t.std(), 0])
+
+
+def test_where_nothing_is_tolerated_equal_predictions_are_alike() -> None:
+    y = np.zeros((3, 1, 10, 1))
+    y[2] = 1e-9
+    strict = Tolerance(np.zeros(1), lambda fits: y[: len(fits)], y[0], np.ones(1), False)
+    with np.errstate(divide="ignore"):
+        assert list(strict.shares([None] * 3, np.ones(1))) == [0, np.inf]  # pyright: ignore[reportArgumentType]
 
 
 @pytest.mark.parametrize(

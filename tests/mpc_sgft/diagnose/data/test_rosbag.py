@@ -131,12 +131,30 @@ def test_without_stamps_the_recorders_time_counts(tmp_path: Path) -> None:
     assert read_bag(tmp_path / "run").streams[0].stamped is False
 
 
-def test_clocks_that_are_apart_are_not_mixed(tmp_path: Path) -> None:
-    late = [(t, ns, joints(10**9 + ns, "a", [k])) for k, (t, ns, _) in enumerate(states())]  # simulated time
-    bag = write_bag(tmp_path / "run", [*late, ("/cmd", 205_000_000, array(3.0))])
-    table = read(bag, Machine(["a"], {"m": Drive("a", "effort")}))
+@pytest.mark.parametrize(
+    ("stamp_of_states", "command"),
+    [
+        (lambda ns: 10**9 + ns, array(3.0)),  # simulated time, no header
+        (lambda ns: 10**9 + ns, joints(START + 204_000_000, "a", [3.0])),  # each by a clock of its own
+        (
+            lambda ns: ns - 1_000_000,
+            joints(10**10, "a", [3.0]),
+        ),  # the first stamp is 0, which says nothing; a board's clock
+    ],
+)
+def test_clocks_that_are_apart_are_not_mixed(stamp_of_states: Callable, command: Any, tmp_path: Path) -> None:
+    rows = [(t, ns, joints(stamp_of_states(ns), "a", [k])) for k, (t, ns, _) in enumerate(states())]
+    bag = write_bag(tmp_path / "run", [*rows, ("/cmd", 205_000_000, command)])
+    table = read(bag, Machine(["a"], {"a": Drive("a", "position")}))
     assert table.columns["qpos/a"][0] == 21 and len(table.columns["time"]) == 39
     assert any("all times are those of the recorder" in note for note in table.notes)
+
+
+def test_one_clock_that_is_not_the_recorders_is_kept(tmp_path: Path) -> None:
+    rows = [(t, ns, joints(10**9 + ns, "a", [k])) for k, (t, ns, _) in enumerate(states())]
+    bag = write_bag(tmp_path / "run", [*rows, ("/cmd", 400_000_000, joints(10**9 + 205_000_000, "a", [3.0]))])
+    table = read(bag, Machine(["a"], {"a": Drive("a", "position")}))
+    assert table.columns["qpos/a"][0] == 21 and not any("recorder: " in note for note in table.notes)
 
 
 def test_speeds_are_taken_and_efforts_only_when_asked_for(tmp_path: Path) -> None:

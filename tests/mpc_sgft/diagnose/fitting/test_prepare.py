@@ -13,11 +13,12 @@ from mpc_sgft.diagnose import diagnose
 from mpc_sgft.diagnose import run as running
 from mpc_sgft.diagnose.candidates.library import make_term
 from mpc_sgft.diagnose.data.check import episodes
-from mpc_sgft.diagnose.data.measured import Episode, read_table
+from mpc_sgft.diagnose.data.measured import Episode, read_table, write_csv
+from mpc_sgft.diagnose.data.smooth import noise_of
 from mpc_sgft.diagnose.fitting import search as searching
 from mpc_sgft.diagnose.fitting.fit import fit
 from mpc_sgft.diagnose.fitting.hypothesis import Hypothesis, judge_fit
-from mpc_sgft.diagnose.fitting.prepare import Problem, Setup, default_signals, near_fit, prepare, typical_sizes
+from mpc_sgft.diagnose.fitting.prepare import Problem, Setup, default_signals, near_fit, prepare, typical, typical_sizes
 from mpc_sgft.diagnose.simulation.plant import Plant, load_plant
 
 
@@ -82,3 +83,23 @@ def test_sensors_of_the_scene_are_compared_too_and_nothing_that_only_ends_like_o
     names = ["qpos/x", "qvel/x", "qvel/x-tip", "force/m", "sensor/tip", "sensor/heat"]
     episode = Episode("a", 0.01, np.zeros((9, 1)), {n: np.zeros(9) for n in names})
     assert default_signals([episode], Plant(mujoco.MjSpec.from_string(scene))) == ["qpos/x", "force/m", "sensor/tip"]
+
+
+def test_an_encoder_that_rests_between_steps_hides_no_less_than_one(slide: Path, moved, tmp_path: Path) -> None:
+    columns = moved(seconds=5.0, coulomb=2.0, noise=0.0)
+    columns["qpos/x"] = 0.05 * np.round(columns["qpos/x"] / 0.05)  # seven of eight samples are as the one before
+    write_csv(tmp_path / "coarse.csv", columns)
+    plant = load_plant(slide)
+    recorded = episodes(read_table(tmp_path / "coarse.csv"), plant.actuators, plant.axes())
+    setup = prepare(plant, recorded, [], window=None, signals=None, held_out=None)
+    assert setup.noise == pytest.approx([0.05 / np.sqrt(12)])
+
+
+def test_what_stands_still_says_nothing_of_noise() -> None:
+    rng = np.random.default_rng(0)
+    shaken = 1e-3 * rng.standard_normal(500)
+    still = Episode("still", 0.01, np.zeros((500, 1)), {"qpos/a": np.ones(500), "qpos/b": np.ones(500)})
+    moves = Episode("moves", 0.01, np.zeros((500, 1)), {"qpos/a": shaken, "qpos/b": np.ones(500)})
+    noise = typical(noise_of, [still, moves, still], ["qpos/a", "qpos/b"])
+    assert noise == pytest.approx([1e-3, 1e-3], rel=0.2)  # b moves nowhere: as the other joint
+    assert typical(noise_of, [still], ["qpos/a"]) == pytest.approx([1e-15])
