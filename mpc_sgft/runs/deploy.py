@@ -130,7 +130,7 @@ class Deployment:
             self.evaluate(table, {})
             self.save()
         if self.viewer:
-            self.viewer.value_map("before", self.transfer.acting)
+            self.viewer.value_map("before", self.transfer.pretrained)
         hidden = cfg.quiet or self.operator.present  # the page shows the same
         done = self.state["rollouts"]
         bar = progress(cfg.rollouts, initial=done, desc=f"deploy {cfg.chosen.method}", unit="rollout", disable=hidden)
@@ -354,6 +354,6 @@ class Deployment:
             "robot": self.env.backend.report() if self.judge is None else None,
             "rrd": str(self.folder / "run.rrd") if self.viewer else None,
         }
-        (self.folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
+        run_folder.write_summary(self.folder, summary)
         self.logger.close()
         return summary

@@ -14,6 +14,7 @@ from mpc_sgft.storage import run_folder
 from mpc_sgft.storage.metrics import progress
 
 CHUNK = 100  # episodes side by side
+APART = 1000  # seeds of the rounds of one seed: those of the next one are others
 
 
 def evaluate(cfg: DictConfig) -> int:
@@ -26,9 +27,9 @@ def evaluate(cfg: DictConfig) -> int:
     act = _policy(cfg, env)
     folder = run_folder.start(cfg)
     build.prepare_process(cfg)
-    rounds = cfg.episodes // env.batch_size[0]
+    rounds, first = cfg.episodes // env.batch_size[0], EVAL_SEED + APART * cfg.seed
     with progress(rounds * env.task.episode_steps, desc="evaluate", disable=cfg.quiet) as bar:
-        parts = [collect(env, shown(act, bar), seed=EVAL_SEED + cfg.seed + i) for i in range(rounds)]
+        parts = [collect(env, shown(act, bar), seed=first + i) for i in range(rounds)]
     result = score(cast(TensorDict, TensorDict.cat(parts)))
     summary = {
         "task": cfg.chosen.task,
@@ -46,8 +47,8 @@ def evaluate(cfg: DictConfig) -> int:
     if cfg.video:
         from mpc_sgft.views.video import write_video
 
-        summary["video"] = str(write_video(folder / "episode.mp4", build.make_env(cfg, 1), act, EVAL_SEED + cfg.seed))
-    (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
+        summary["video"] = str(write_video(folder / "episode.mp4", build.make_env(cfg, 1), act, first))
+    run_folder.write_summary(folder, summary)
     print(json.dumps(summary))
     return 0
 

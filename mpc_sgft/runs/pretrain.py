@@ -160,7 +160,7 @@ def pretrain(cfg: DictConfig) -> int:
         "seconds": watch.rounded(),
         "checkpoint": str(folder / "checkpoint" / "model.safetensors"),
     }
-    (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
+    run_folder.write_summary(folder, summary)
     logger.close()
     print(json.dumps(summary))
     return 0

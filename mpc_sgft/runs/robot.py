@@ -132,6 +132,6 @@ def dry_run(cfg: DictConfig, model: WorldModel, env: ControlEnv) -> int:
         "first_observation": [round(float(x), 3) for x in rollout.steps["observation"][0, : env.raw_dim]],
         "robot": env.backend.report(),  # type: ignore[attr-defined]
     }
-    (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
+    run_folder.write_summary(folder, summary)
     print(json.dumps(summary))
     return 0

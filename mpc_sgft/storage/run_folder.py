@@ -18,6 +18,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from mpc_sgft import __version__
 from mpc_sgft.command.errors import UserError, disk_error
+from mpc_sgft.storage.whole_file import write_whole
 
 PACKAGES = "torch torchrl tensordict mujoco gymnasium numpy scipy hydra-core safetensors mcap rerun-sdk".split()
 
@@ -86,6 +87,11 @@ def _link(link: Path, folder: Path) -> None:
     fresh.unlink(missing_ok=True)
     fresh.symlink_to(os.path.relpath(folder, link.parent), target_is_directory=True)
     fresh.replace(link)
+
+
+def write_summary(folder: Path, summary: dict[str, Any]) -> None:
+    """summary.json, whole or not at all: who finds it takes the run as finished."""
+    write_whole(folder / "summary.json", (json.dumps(summary, indent=2) + "\n").encode())
 
 
 def versions() -> dict[str, Any]:

@@ -33,23 +33,25 @@ class DeployViewer:
     Args:
         path: The .rrd.
         env: The task, for its model and its named points.
-        megabytes: That the file stays below, as in `RunViewer`.
+        megabytes: That the file stays below, as in `RunViewer`; 0: no bound.
         resume: Go on with a file that is there.
     """
 
     def __init__(self, path: Path, env: ControlEnv, *, megabytes: float = 300.0, resume: bool):
         self.env, self.task = env, env.task
         model = getattr(env.backend, "model", None)
-        dt, limit = env.task.control_dt, int(megabytes * 1e6)
+        dt, limit = env.task.control_dt, int(megabytes * 1e6) or None
         self.viewer = RunViewer(path, model, control_dt=dt, layout=layout(env), limit=limit, resume=resume)
         self.limits: tuple[float, float] | None = None
 
     def episode(self, rollout: Rollout, model: WorldModel, error: Tensor, number: int, discount: float) -> None:
-        """Add one rollout; one read back from a file has no imagination to show."""
+        """Add one rollout; one read back from a file has no imagination to show, and may be there already."""
         steps, names = rollout.steps, self.task.points(np.zeros((1, self.env.raw_dim)))
         observation = torch.cat([steps["observation"], steps["next", "observation"][-1:]])
         real = self._points(observation[:, : self.env.raw_dim])
         title = f"rollout {number}" + (f" (aborted: {rollout.aborted})" if rollout.aborted else "")
+        if rollout.plans is None and title in self.viewer.earlier:
+            return
         reward = steps["next", "reward"][:, 0].numpy()
         view = EpisodeView(
             title=title,
@@ -116,6 +118,7 @@ def _realised(model: WorldModel, following, reward: np.ndarray, horizon: int, di
     device = next(model.parameters()).device
     with torch.inference_mode():
         value = model.terminal_value(model.encode(following["observation"].to(device))).cpu().numpy()
+    value = np.where(following["terminated"][:, 0], 0.0, value)  # nothing comes after
     out = np.empty_like(reward)
     for t in range(len(reward)):
         end = min(t + horizon, len(reward))

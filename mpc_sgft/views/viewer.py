@@ -18,6 +18,7 @@ counts episodes. Entities:
 | episodes                | outcomes in words                                                                       |
 """
 
+import itertools
 import math
 import struct
 import tempfile
@@ -40,6 +41,7 @@ from mpc_sgft.views.value_image import log_value_map
 __all__ = ["Candidates", "EpisodeView", "Layout", "RunViewer"]
 
 RRD_MAGIC, RRD_HEADER = b"RRF", 12  # how a file begins; bytes before its first frame
+NOT_DRAWN = " (not drawn: this file is bounded by log.rerun_mb)"
 RRD_FRAME, RRD_FOOTER = struct.Struct("<QQ"), 0  # kind and length of a frame; the kind after the last message
 
 
@@ -73,6 +75,7 @@ class RunViewer:
         self.path, self._limit = Path(path), limit
         self._model, self._layout = model, layout
         self._step, self._episode = 0, 0
+        self.earlier: set[str] = set()  # titles of the episodes that a resumed file held
         aside = self.path.with_suffix(".earlier.rrd")
         chunks = _set_aside(self.path, aside) if resume else []
         # Rerun's own file sink may wait forever on a full disk, so the bytes are taken from memory and written here.
@@ -111,7 +114,7 @@ class RunViewer:
         outcome = {True: "success", False: "no success", None: "ended"}[data.success]
         total = "" if data.reward is None else f", return {float(np.sum(data.reward)):.2f}"
         text = f"{self._episode}: {outcome}, {data.steps} steps{total}. {data.title}"
-        text += "" if drawn else " (not drawn: this file is bounded by log.rerun_mb)"
+        text += "" if drawn else NOT_DRAWN
         level = rr.TextLogLevel.WARN if data.success is False else rr.TextLogLevel.INFO
         self._recording.log("episodes", rr.TextLog(text, level=level))
         if data.success is not None:
@@ -203,6 +206,8 @@ class RunViewer:
                 batch = chunk.to_record_batch()
                 self._step = max(self._step, *(row + 1 for row in batch.column("env_step").to_pylist()))
                 self._episode = max(self._episode, *(row + 1 for row in batch.column("episode").to_pylist()))
+                said = itertools.chain(*batch.column("TextLog:text").to_pylist())
+                self.earlier |= {text.partition(". ")[2].removesuffix(NOT_DRAWN) for text in said}
 
     def _flush(self) -> None:
         """Put everything so far into the file."""

@@ -91,7 +91,7 @@ def starts(repeats: int) -> list[dict[str, object]]:
 
 
 def first_rollout(**environment: str) -> float:
-    """Seconds until a new deployment, with these environment variables, has recorded its first rollout."""
+    """Seconds until a new deployment, with these environment variables, begins its first rollout."""
     with tempfile.TemporaryDirectory() as folder:
         first = Path(folder) / "run" / "episodes" / "0001.mcap"
         words = ["rollouts=1", "eval_episodes=1", "quiet=true", f"run_dir={folder}/run"]

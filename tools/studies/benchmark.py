@@ -145,12 +145,15 @@ def main() -> None:
     except ImportError:
         parser.error("rliable is not installed: pip install 'mpc_sgft[benchmark]'")
     curves = args.folder / "curves.csv"
+    if curves.resolve() in [path.resolve() for path in args.measured]:
+        parser.error(f"--with {curves}: that is where the runs made here are written. Move it, or give another FOLDER.")
     wanted = list(itertools.product(args.gaps, args.methods, args.variants, args.seeds))
     try:
         there = read_curves(args.measured)
         if not args.score_only:
             known = {key for key in wanted if key[3] in there[key[0]][named(*key[1:3])]}
-            study.run(curves, args, args.folder.name, known)
+            if not {*wanted} <= known:
+                study.run(curves, args, args.folder.name, known)
         runs = read_curves([*([curves] if curves.exists() else []), *args.measured])
     except (ValueError, FileNotFoundError) as error:
         sys.exit(f"error: {error}")

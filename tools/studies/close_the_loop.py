@@ -22,7 +22,7 @@ from mpc_sgft.diagnose.__main__ import main as diagnose
 from mpc_sgft.runs import build
 from mpc_sgft.runs.exploration import explore
 from tools import asid
-from tools.studies.runner import finished, write
+from tools.studies.runner import asked_before, finished, write
 from tools.studies.study import COLUMNS as CURVE
 
 COLUMNS = [
@@ -69,15 +69,17 @@ def main() -> None:
         for seed in args.seeds:
             run = args.runs / f"{beginning}{gap}-{seed}"
             new = args.explore and not (run / "config.yaml").exists()
-            words = [*args.set, *(exploring(seed, args.ranges, args.set) if new else [])]
-            rows.append(one(gap, seed, run, run / folder, words, how))
+            first = exploring(seed, args.ranges, args.set) if new else []
+            rows.append(one(gap, seed, run, run / folder, args.set, how, first))
             write(args.csv, COLUMNS, rows)
             if args.curves:
                 curves += curve(rows[-1], run, run / folder, variant, explored=args.explore)
                 write(args.curves, CURVE, curves)
 
 
-def one(gap: str, seed: int, run: Path, found: Path, overrides: list[str], how: list[str]) -> dict[str, object]:
+def one(
+    gap: str, seed: int, run: Path, found: Path, overrides: list[str], how: list[str], first: list[str]
+) -> dict[str, object]:
     """One row; raises RunFailed or SystemExit if a command fails.
 
     Args:
@@ -85,8 +87,10 @@ def one(gap: str, seed: int, run: Path, found: Path, overrides: list[str], how: 
         run: Folder of the first.
         found: Of the diagnosis.
         how: Options of `diagnose --run`.
+        first: More overrides of the first deployment, where it begins.
     """
-    finished("deploy", run, [f"gap={gap}", f"seed={seed}", "log.rerun=false", *overrides])
+    finished("deploy", run, [f"gap={gap}", f"seed={seed}", "log.rerun=false", *overrides], first=first)
+    asked_before(found, how)
     if not ((found / "retrain.json").exists() or named_nothing(found / "report.json")):
         check(diagnose(["--run", str(run), "--out", str(found), *how]))
     row: dict[str, object] = {"gap": gap, "seed": seed} | named(found)

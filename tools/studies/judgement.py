@@ -200,7 +200,11 @@ def _known(names: str) -> str:
 def judged(folder: Path, names: list[str], without: list[str], jobs: int) -> dict[str, dict[str, dict[str, Any]]]:
     """Reports of a folder's cases by what is out of the way; cases on disk that have all of them are not done again."""
     kept = folder / "judgement.jsonl"  # a case a line, so that a stopped run goes on
-    found = dict(map(json.loads, kept.read_text().splitlines())) if kept.is_file() else {}
+    text = kept.read_text() if kept.is_file() else ""
+    whole = text[: text.rfind("\n") + 1]  # a process that was killed leaves half a line
+    if whole != text:
+        kept.write_text(whole)
+    found = dict(map(json.loads, whole.splitlines()))
     todo = [name for name in names if not {*without} <= {*found.get(name, ())}]
     with ProcessPoolExecutor(jobs) as pool, kept.open("a") as file:
         futures = {pool.submit(ablate, folder / "cases" / name, without): name for name in todo}

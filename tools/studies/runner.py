@@ -5,6 +5,7 @@ in the CSV is not measured again.
 """
 
 import csv
+import io
 import itertools
 import json
 import os
@@ -16,6 +17,8 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, TypeVar
 
+from mpc_sgft.storage.whole_file import write_whole
+
 Job = TypeVar("Job")
 NEEDED = {"gap", "method", "variant", "seed", "rollouts", "success"}  # columns of learning curves
 Runs = dict[str, dict[str, dict[int, dict[int, dict[str, str]]]]]  # gap -> method -> seed -> rollouts -> row
@@ -25,7 +28,9 @@ class RunFailed(Exception):
     """A run of a study ended with an error; the message holds the end of what it said."""
 
 
-def finished(command: str, folder: Path, overrides: Sequence[str], launcher: str | None = None) -> dict[str, Any]:
+def finished(
+    command: str, folder: Path, overrides: Sequence[str], launcher: str | None = None, first: Sequence[str] = ()
+) -> dict[str, Any]:
     """The summary of `python -m mpc_sgft.COMMAND` in a run folder: read if it is there, else run or resumed.
 
     Args:
@@ -33,13 +38,15 @@ def finished(command: str, folder: Path, overrides: Sequence[str], launcher: str
         folder: The run folder; with a launcher, where the other machines see it too.
         overrides: Of the run, and of the launcher.
         launcher: A Hydra launcher that starts the run elsewhere; None: here. It does not resume what was cut off.
+        first: More overrides, where it begins; another time they need not be the same.
 
     Raises:
-        RunFailed: If the command does.
+        RunFailed: If the command does, if the folder is of a run with other overrides, or its summary cannot be read.
     """
+    asked_before(folder, [command, *(word for word in overrides if not word.startswith("hydra."))])
     summary = folder / "summary.json"
     if not summary.exists():
-        words = [f"run_dir={folder}", "quiet=true", *overrides]
+        words = [f"run_dir={folder}", "quiet=true", *overrides, *first]
         begun = (folder / "config.yaml").exists()
         if launcher is not None and begun:
             raise RunFailed(
@@ -52,7 +59,30 @@ def finished(command: str, folder: Path, overrides: Sequence[str], launcher: str
         done = subprocess.run(line, capture_output=True, text=True, env=os.environ | {"OMP_NUM_THREADS": "1"})
         if done.returncode:
             raise RunFailed(f"{folder}: exit code {done.returncode}\n{done.stderr[-2000:]}")
-    return json.loads(summary.read_text())
+    try:
+        return json.loads(summary.read_text())
+    except json.JSONDecodeError as error:
+        raise RunFailed(f"{summary} cannot be read ({error}): remove it, and the run is resumed.") from error
+
+
+def asked_before(folder: Path, words: Sequence[str]) -> None:
+    """Note beside a folder what is asked of it, the first time.
+
+    Raises:
+        RunFailed: If that was something else then, or it was not noted.
+    """
+    kept = folder.with_name(f"{folder.name}.asked")
+    if kept.exists():
+        before = kept.read_text().splitlines()
+    else:
+        before = ["unknown settings"] if folder.exists() else [*words]
+        if before == [*words]:
+            write_whole(kept, "".join(f"{word}\n" for word in words).encode())
+    if before != [*words]:
+        raise RunFailed(
+            f"{folder} was made with {' '.join(before)}, asked for is {' '.join(words)}. "
+            "Give another --runs, or remove it."
+        )
 
 
 def first_mean(folder: Path, column: str, rows: int) -> float | None:
@@ -81,11 +111,11 @@ def each(jobs: Sequence[Job], work: Callable[[Job], dict[str, Any]], side_by_sid
 
 def write(path: Path, columns: Sequence[str], rows: Iterable[dict[str, Any]]) -> None:
     """A whole CSV, its folder made if need be."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("w", newline="") as file:
-        table = csv.DictWriter(file, columns, extrasaction="ignore", lineterminator="\n")
-        table.writeheader()
-        table.writerows(rows)
+    file = io.StringIO(newline="")
+    table = csv.DictWriter(file, columns, extrasaction="ignore", lineterminator="\n")
+    table.writeheader()
+    table.writerows(rows)
+    write_whole(path, file.getvalue().encode())
 
 
 def measured(path: Path, columns: Sequence[str], keys: Sequence[dict[str, Any]], work: Callable[..., dict]) -> None:

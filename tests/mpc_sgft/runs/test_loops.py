@@ -1,6 +1,7 @@
 """The three commands as real processes, on the pendulum with tiny networks."""
 
 import contextlib
+import copy
 import csv
 import io
 import json
@@ -18,8 +19,12 @@ from safetensors.torch import load_file
 
 from mpc_sgft import deploy, evaluate, pretrain
 from mpc_sgft.command.errors import UserError
+from mpc_sgft.learning.transfer import Transfer
+from mpc_sgft.runs import evaluate as evaluating
 from mpc_sgft.storage import checkpoint
 from mpc_sgft.storage.episode_file import read_episode
+from mpc_sgft.views.deploy_view import DeployViewer
+from tests.mpc_sgft.views.test_viewer import columns
 from tools.studies import relearn
 
 TINY = ["+experiment=debug", "task=pendulum", "log.tensorboard=false", "log.rerun=false"]
@@ -208,6 +213,52 @@ def test_a_killed_deployment_loses_at_most_the_step_in_flight(pretrained, tmp_pa
     assert summary["seconds"]["learn"] >= 100
     assert len(read_episode(second).transitions["step"]) == kept  # what happened is not driven again
     assert read_episode(folder / "episodes" / "0003.mcap").complete
+
+
+class Killed(BaseException):
+    """Nobody catches it."""
+
+
+def test_a_rollout_is_drawn_once_although_the_process_died_learning_from_it(pretrained, tmp_path, monkeypatch):
+    folder, learn, maps = tmp_path / "run", Transfer.learn, []
+
+    def dies(self, *rest, **more):
+        if self.verdicts:
+            raise Killed
+        return learn(self, *rest, **more)
+
+    def watched(self, name, model):
+        maps.append((name, copy.deepcopy(model.state_dict())))
+
+    words = ["gap=pendulum_torque", "rollouts=3", "method.updates=2", "method.gate=false", "log.rerun=true"]
+    with monkeypatch.context() as patch, pytest.raises(Killed):
+        patch.setattr(Transfer, "learn", dies)
+        here("deploy", f"checkpoint={pretrained}", f"run_dir={folder}", *words, "log.rerun_mb=0")
+    assert checkpoint.load_state(folder / "checkpoint" / "state.pt")["loop"]["rollouts"] == 1
+    monkeypatch.setattr(DeployViewer, "value_map", watched)
+    assert here("deploy", "--resume", str(folder)).returncode == 0
+    texts = [text for row in columns(folder / "run.rrd")["/episodes"]["TextLog:text"] for text in row]
+    assert [text.partition(". ")[2] for text in texts] == ["rollout 1", "rollout 2", "rollout 3"]
+    began = load_file(pretrained / "checkpoint" / "model.safetensors")
+    (_, before), (_, after) = maps
+    assert all((before[k] == x).all() for k, x in began.items()) and not all(
+        (after[k] == x).all() for k, x in began.items()
+    )
+
+
+def test_evaluations_of_different_seeds_share_no_round(pretrained, tmp_path, monkeypatch):
+    seeds, collect = [], evaluating.collect
+
+    def watched(*args, seed):
+        seeds.append(seed)
+        return collect(*args, seed=seed)
+
+    monkeypatch.setattr(evaluating, "collect", watched)
+    monkeypatch.setattr(evaluating, "CHUNK", 2)
+    for seed in "012":
+        words = [f"checkpoint={pretrained}", f"run_dir={tmp_path / seed}", f"seed={seed}", "episodes=6"]
+        assert here("evaluate", *words).returncode == 0
+    assert len(set(seeds)) == len(seeds) == 9
 
 
 def test_evaluate_reports_an_interval(pretrained, tmp_path):

@@ -86,6 +86,22 @@ def test_what_was_measured_before_is_not_run_again(curves, tmp_path, monkeypatch
     assert rows["good", "3"]["after"] == "0.96" and rows["good", "4"]["after"] == "0.5"
 
 
+def test_curves_to_take_in_are_never_written_over(curves, tmp_path, monkeypatch, capsys) -> None:
+    folder = tmp_path / "out"
+    folder.mkdir()
+    kept = folder / "curves.csv"
+    kept.write_text(before := curves.read_text())
+    words = ["benchmark", str(folder), "--gaps", "a", "--methods", "good", "--seeds", "3", "--at", "10", "--with"]
+    monkeypatch.setattr("sys.argv", [*words, str(kept)])
+    with pytest.raises(SystemExit):
+        benchmark.main()
+    assert "Move it" in capsys.readouterr().err and kept.read_text() == before
+    kept.unlink()
+    monkeypatch.setattr("sys.argv", [*words, str(curves)])  # all of it is known: there is nothing to run
+    benchmark.main()
+    assert not kept.exists() and (folder / "runs.csv").is_file()
+
+
 def test_who_is_probably_better(curves) -> None:
     found = benchmark.better(benchmark.summaries(benchmark.read_curves([curves]), 10), 10)
     by = {(f["method"], f["over"]): f for f in found}

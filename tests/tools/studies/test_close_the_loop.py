@@ -10,11 +10,19 @@ import torch
 from mpc_sgft.command.compose import compose
 from mpc_sgft.runs.exploration import Exploration
 from tools.studies import close_the_loop
-from tools.studies.runner import read_curves
+from tools.studies.runner import RunFailed, read_curves
+
+HOW = ["--retrain", "--retrain-transitions", "60000"]
 
 
-def deployment(folder: Path, zero_shot: float) -> None:
+def asked(folder: Path, *words: str) -> None:
+    """What a study notes beside a folder that it makes."""
+    folder.with_name(f"{folder.name}.asked").write_text("\n".join(words))
+
+
+def deployment(folder: Path, zero_shot: float, seed: int = 0) -> None:
     folder.mkdir(parents=True)
+    asked(folder, "deploy", "gap=turned", f"seed={seed}", "log.rerun=false")
     curves = {"curve": {"0": zero_shot, "10": zero_shot}, "return_curve": {"0": -1.0, "10": -1.0}}
     summary = {"real_rollouts": 10, "evaluation_episodes": 100, **curves}
     (folder / "summary.json").write_text(json.dumps(summary))
@@ -24,8 +32,9 @@ def test_what_was_measured_is_written_and_nothing_runs_again(tmp_path: Path, mon
     angle = {"name": "frame_rotation", "at": ["base"], "parameters": {"angle": {"value": 0.6}}}
     for seed, effects in ((0, [angle]), (1, [])):
         run = tmp_path / "runs" / f"turned-{seed}"
-        deployment(run, 0.1)
+        deployment(run, 0.1, seed)
         (run / "diagnosis").mkdir()
+        asked(run / "diagnosis", *HOW)
         report = {"verdict": "effect" if effects else "none", "effects": effects, "seconds": 80.0}
         (run / "diagnosis" / "report.json").write_text(json.dumps(report))
         if effects:
@@ -36,6 +45,9 @@ def test_what_was_measured_is_written_and_nothing_runs_again(tmp_path: Path, mon
     words = ["loop", str(tmp_path / "loop.csv"), "--gaps", "turned", "--seeds", "0", "1", "--runs", f"{tmp_path}/runs"]
     monkeypatch.setattr("sys.argv", [*words, "--curves", str(tmp_path / "curves.csv")])
     close_the_loop.main()
+    monkeypatch.setattr("sys.argv", [*words, "--effects", "payload"])
+    with pytest.raises(RunFailed, match="diagnosis was made with --retrain .* asked for is .* --effects payload"):
+        close_the_loop.main()  # else the old verdict would pass for that of another question
     first, second = csv.DictReader((tmp_path / "loop.csv").open())
     assert (first["found"], first["zero_shot_after"]) == ("frame_rotation@base angle=0.6", "0.9")
     assert (second["verdict"], second["found"], second["zero_shot_after"]) == ("none", "", "")
@@ -52,6 +64,7 @@ def test_ranges_are_a_method_of_their_own_beside(
     deployment(run, 0.1)
     (run / "config.yaml").touch()
     deployment(run / "ranges" / "deploy", 0.7)
+    asked(run / "ranges", *HOW, "--ranges", "push")
     outcome = {"zero_shot_success": 0.7, "final_success": 0.7, "rollouts_to_95": None}
     both = {"transitions": 60000, "before": outcome | {"zero_shot_success": 0.1}, "after": outcome}
     (run / "ranges" / "retrain.json").write_text(json.dumps(both))

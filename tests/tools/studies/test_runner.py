@@ -17,8 +17,13 @@ def test_a_run_is_made_once_and_resumed_if_cut_off(tmp_path):
     stamp = (run / "checkpoint" / "state.pt").stat().st_mtime_ns
     (run / "summary.json").write_text(json.dumps({"known": True}))
     assert finished("pretrain", run, TINY) == {"known": True}  # it is there: nothing runs
+    (run / "summary.json").write_text('{"known')
+    with pytest.raises(RunFailed, match="summary.json cannot be read"):
+        finished("pretrain", run, TINY)
     (run / "summary.json").unlink()
-    assert finished("pretrain", run, ["seed=99"])["seed"] == 0  # resumed: the run's own settings
+    with pytest.raises(RunFailed, match="made with pretrain .* asked for is pretrain seed=99"):
+        finished("pretrain", run, ["seed=99"])
+    assert finished("pretrain", run, TINY)["seed"] == 0  # resumed
     assert (run / "checkpoint" / "state.pt").stat().st_mtime_ns > stamp
 
 
@@ -32,6 +37,7 @@ def test_a_launcher_starts_a_run_elsewhere(tmp_path):
     words = ["policy=scripted", "episodes=2", minutes]
     with pytest.raises(RunFailed, match="error: No checkpoint at /nowhere"):
         finished("evaluate", tmp_path / "bad", ["checkpoint=/nowhere/at/all", "episodes=2"], launcher)
+    (tmp_path / "begun.asked").write_text("evaluate\npolicy=scripted\nepisodes=2\n")
     (tmp_path / "begun").mkdir()
     (tmp_path / "begun" / "config.yaml").touch()
     with pytest.raises(RunFailed, match="begun and not finished"):

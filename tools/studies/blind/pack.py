@@ -4,6 +4,7 @@ import gzip
 import json
 from pathlib import Path
 
+from mpc_sgft.storage.whole_file import write_whole
 from tools.studies.blind import cases
 from tools.studies.blind.solve import reports
 
@@ -43,7 +44,6 @@ def unpack(source: Path, out: Path) -> tuple[int, int]:
     for row in same:
         path = out / row["kind"] / row["case"] / "blind.json"
         if not path.is_file():
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_text(json.dumps(row["report"]))
+            write_whole(path, json.dumps(row["report"]).encode())
             new += 1
     return new, len(rows) - len(same)
