@@ -11,6 +11,8 @@ import numpy as np
 from mujoco.batch import Batch
 from numpy.typing import NDArray
 
+from envs.effects.base import ADDED
+
 OPERATIONS = {"add": np.add, "scale": np.multiply, "set": lambda nominal, drawn: np.full_like(nominal, drawn)}
 
 
@@ -64,7 +66,9 @@ def load(draws: Mapping[str, Mapping[str, Any]]) -> list[Draw]:
     built = []
     for name, entries in draws.items():
         try:
-            known: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in entries.items()}
+            known: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in (entries or {}).items()}
+            for key in {"fields", "at"} & set(known):
+                known[key] = (known[key],) if isinstance(known[key], str) else known[key]
             built.append(Draw(**known))
         except TypeError as error:
             raise ValueError(
@@ -152,7 +156,7 @@ class Randomizer:
 
 
 def _locate(model: mujoco.MjModel, field: str, at: tuple[str, ...]) -> tuple[str, list[int], int | None]:
-    """(field name, row indices, column) of 'geom_friction[0]' at the named rows."""
+    """(field name, row indices, column) of 'geom_friction[0]' at the named rows; of all but effects' own without names."""
     match = re.fullmatch(r"(\w+?)(?:\[(\d+)\])?", field)
     name = match[1] if match else field
     if not match or not hasattr(model, name):
@@ -172,4 +176,13 @@ def _locate(model: mujoco.MjModel, field: str, at: tuple[str, ...]) -> tuple[str
         raise ValueError(f"randomise {field}: {error.args[0]}") from error
     if prefix == "dof":
         ids = [int(dof) for i in ids for dof in np.flatnonzero(model.dof_jntid == i)]
-    return name, ids or list(range(len(array))), column
+    return name, ids if at else _own(model, prefix, len(array)), column
+
+
+def _own(model: mujoco.MjModel, prefix: str, count: int) -> list[int]:
+    """Rows without actuators and tendons that effects put into the scene; a rotor has what its joint gave it."""
+    if prefix == "actuator":
+        return np.flatnonzero(model.actuator_ctrlspec != int(mujoco.mjtCtrlInput.mjINPUT_NONE)).tolist()
+    if prefix == "tendon":
+        return [i for i in range(count) if not model.tendon(i).name.startswith(ADDED)]
+    return list(range(count))

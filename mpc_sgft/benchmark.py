@@ -98,8 +98,8 @@ class RealRollouts(GymEnv):
 
 
 def simulated(task: str, *, render_mode: str | None = None) -> GymEnv:
-    """The simulator of a task, drawn anew each episode as in pretraining; nothing is counted."""
-    return GymEnv(_env(task, "none", 1, randomised=True), render_mode=render_mode)
+    """The simulator of a task, drawn and started anew each episode as in pretraining; nothing is counted."""
+    return GymEnv(_env(task, "none", 1, randomised=True, learning=True), render_mode=render_mode)
 
 
 def evaluate(name: str, act: Callable[[Floats], NDArray[Any]], *, episodes: int = EPISODES) -> Score:
@@ -130,9 +130,9 @@ def evaluate(name: str, act: Callable[[Floats], NDArray[Any]], *, episodes: int 
     return score(collect(env, chosen, seed=EVAL_SEED))
 
 
-def _env(task: str, gap: str, num_envs: int, *, randomised: bool = False) -> ControlEnv:
+def _env(task: str, gap: str, num_envs: int, *, randomised: bool = False, learning: bool = False) -> ControlEnv:
     words = [f"task={task}", f"gap={gap}", f"randomize={task if randomised else 'none'}"]
-    return build.make_env(compose("evaluate", words, []), num_envs, randomised=randomised)
+    return build.make_env(compose("evaluate", words, []), num_envs, randomised=randomised, learning=learning)
 
 
 def _register() -> None:
@@ -141,7 +141,8 @@ def _register() -> None:
         gymnasium.register(id=f"mpc_sgft/{task}-sim-v0", entry_point=f"{ours}simulated", kwargs={"task": task})
         for name, gap in gaps.items():
             kwargs = {"task": task, "gap": gap}
-            gymnasium.register(id=f"mpc_sgft/{task}-{name}-v0", entry_point=f"{ours}RealRollouts", kwargs=kwargs)
+            id_ = f"mpc_sgft/{task}-{name}-v0"  # a seed alone does not repeat a start: the count of rollouts does, too
+            gymnasium.register(id=id_, entry_point=f"{ours}RealRollouts", nondeterministic=True, kwargs=kwargs)
 
 
 _register()

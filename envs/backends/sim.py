@@ -81,7 +81,7 @@ class SimBackend:
         self.noise_sd, self.noise_probability, self.believes = noise_sd, noise_probability, reward == "observed"
         self.steps = whole_steps(task.control_dt, task.sim_dt)
         self.has_force = any(type(e).force is not Effect.force for e in self.effects)
-        self.dry = LoadFriction(self.batch, nominal, self.effects)
+        self.dry = LoadFriction(self.batch, nominal, self.model, self.effects)
         self.actuators = [nominal.actuator(i).name for i in range(nominal.nactuator)]
         self.counters: Counter[str] = Counter()
         self.note = ""

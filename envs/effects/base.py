@@ -25,7 +25,9 @@ from numpy.typing import NDArray
 from envs.task import AbstractTask
 
 Array = NDArray[np.float64]
-ROTOR = "rotor/"  # names of the joints that backlash and flexible_joint add begin so
+ROTOR = "rotor/"  # names of the joints and tendons that backlash and flexible_joint add begin so
+SPRING = "joint_stiffness/"  # names of the tendons that joint_stiffness adds begin so
+ADDED = (ROTOR, SPRING)  # elements with such names are not the machine's own
 
 
 @dataclass(frozen=True)
@@ -173,23 +175,23 @@ def per_axis(value: float | tuple[float, ...], size: int, what: str) -> Array:
 def pick(elements: list[Any], at: tuple[str, ...], kind: str) -> list[Any]:
     """The scene's elements with the names in `at`, or all of them if `at` is empty.
 
-    "All" are those of the machine itself: no rotors that another effect added, and never an actuator without an
-    input, which is how other effects enter a scene.
+    "All" are those of the machine itself: no rotors or tendons that another effect added, and never an actuator
+    without an input, which is how other effects enter a scene.
 
     Raises:
         ValueError: For a name that the scene lacks.
     """
     if kind == "actuator":
         elements = [e for e in elements if e.ctrlspec != int(mujoco.mjtCtrlInput.mjINPUT_NONE)]
-    if kind == "joint" and not at:
-        elements = [e for e in elements if not e.name.startswith(ROTOR)]
+    if kind in ("joint", "tendon") and not at:
+        elements = [e for e in elements if not e.name.startswith(ADDED)]
     names = [e.name for e in elements]
     indices(names, at, kind)
     return [e for e in elements if not at or e.name in at]
 
 
 def indices(names: list[str], at: tuple[str, ...], kind: str) -> list[int]:
-    """Where the names in `at` stand among `names`; everywhere if `at` is empty.
+    """Where the names in `at` stand among `names`, in the order of `at`; everywhere if it is empty.
 
     Raises:
         ValueError: For a name that is not there.
@@ -197,7 +199,14 @@ def indices(names: list[str], at: tuple[str, ...], kind: str) -> list[int]:
     for name in at:
         if name not in names:
             raise ValueError(f"No {kind} {name!r} in this scene. Available: {', '.join(n for n in names if n)}.")
-    return [i for i, name in enumerate(names) if not at or name in at]
+    return [names.index(name) for name in at] if at else list(range(len(names)))
+
+
+def decide(spec: mujoco.MjSpec, named: list[Any]) -> None:
+    """Let geoms and flexes decide in each of their contacts with others: the higher `priority` does."""
+    others = [e.priority for e in [*spec.geoms, *spec.flexes] if all(e is not n for n in named)]
+    for element in named:
+        element.priority = max(element.priority, 1 + max(others, default=0))
 
 
 def per_name(value: float | tuple[float, ...], names: tuple[str, ...], what: str) -> dict[str, float]:

@@ -5,12 +5,15 @@ from typing import ClassVar
 
 import mujoco
 
-from envs.effects.base import Effect, pick
+from envs.effects.base import Effect, decide, pick
 
 
 @dataclass(frozen=True)
 class ContactFriction(Effect):
-    """Set the sliding friction of geoms, and let it decide in each of their contacts (`priority`)."""
+    """Set the sliding friction of geoms, and let it decide in each of their contacts (`priority`).
+
+    Where two such effects meet in a contact, the one that is listed last decides.
+    """
 
     coefficient: float = 1.0
     at: tuple[str, ...] = ("puck",)  # geoms
@@ -19,9 +22,10 @@ class ContactFriction(Effect):
     bounds: ClassVar[dict[str, tuple[float, float]]] = {"coefficient": (0.0, 10.0)}
 
     def edit_spec(self, spec: mujoco.MjSpec) -> None:
-        for geom in pick([*spec.geoms, *spec.flexes], self.at, "geom"):
+        named = pick([*spec.geoms, *spec.flexes], self.at, "geom")
+        for geom in named:
             geom.friction[0] = self.coefficient
-            geom.priority = max(geom.priority, 1)
+        decide(spec, named)
 
 
 EFFECT = ContactFriction

@@ -6,7 +6,7 @@ from typing import ClassVar
 import mujoco
 import numpy as np
 
-from envs.effects.base import Effect, pick
+from envs.effects.base import Effect, decide, pick
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,8 @@ class ContactSoftness(Effect):
     def edit_spec(self, spec: mujoco.MjSpec) -> None:
         if not self.time_constant:
             return
-        for geom in pick(spec.geoms, self.at, "geom"):
+        named = pick(spec.geoms, self.at, "geom")
+        for geom in named:
             first, second = geom.solref
             if first > 0:
                 geom.solref[0] = first + self.time_constant
@@ -35,8 +36,8 @@ class ContactSoftness(Effect):
                 own = 2 / (geom.solimp[1] * -second)
                 scale = own / (own + self.time_constant)
                 geom.solref = np.array([first * scale**2, second * scale])
-            if self.at:
-                geom.priority = max(geom.priority, 1)
+        if self.at:
+            decide(spec, named)
 
 
 EFFECT = ContactSoftness

@@ -6,7 +6,7 @@ from typing import ClassVar
 import mujoco
 import numpy as np
 
-from envs.effects.base import Effect
+from envs.effects.base import SPRING, Effect
 from envs.effects.passive import scalar_joints, unused_name
 
 
@@ -31,7 +31,7 @@ class JointStiffness(Effect):
                 joint.stiffness[0] = self.stiffness
                 joint.springref = np.rad2deg(self.rest) if in_degrees else self.rest
             else:
-                tendon = spec.add_tendon(name=unused_name(spec.tendons, f"joint_stiffness/{joint.name}"))
+                tendon = spec.add_tendon(name=unused_name(spec.tendons, f"{SPRING}{joint.name}"))
                 tendon.wrap_joint(joint.name, 1.0)
                 tendon.stiffness[0], tendon.springlength = self.stiffness, [self.rest, self.rest]
 

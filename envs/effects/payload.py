@@ -6,6 +6,7 @@ from typing import ClassVar
 import mujoco
 
 from envs.effects.base import Effect, pick
+from envs.effects.passive import unused_name
 
 
 @dataclass(frozen=True)
@@ -21,7 +22,12 @@ class Payload(Effect):
 
     def edit_spec(self, spec: mujoco.MjSpec) -> None:
         for body in pick(spec.bodies, self.at, "body"):
-            load = body.add_body(name=f"payload_{body.name}", pos=list(self.position))
+            if self.mass and not moves(body):
+                raise ValueError(
+                    f"payload at {body.name!r}: nothing moves this body (what is soft moves by nodes of its own), so "
+                    "that a load would do nothing"
+                )
+            load = body.add_body(name=unused_name(spec.bodies, f"payload_{body.name}"), pos=list(self.position))
             load.add_geom(
                 type=mujoco.mjtGeom.mjGEOM_SPHERE,
                 size=[0.01, 0, 0],
@@ -30,6 +36,15 @@ class Payload(Effect):
                 conaffinity=0,
                 rgba=[0, 0, 0, 0],
             )
+
+
+def moves(body: mujoco._specs.MjsBody) -> bool:
+    """Whether a body or one that carries it has a joint."""
+    while body is not None:
+        if len(body.joints):
+            return True
+        body = body.parent
+    return False
 
 
 EFFECT = Payload

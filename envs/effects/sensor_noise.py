@@ -9,7 +9,7 @@ from envs.task import AbstractTask
 
 
 def columns(task: AbstractTask, at: tuple[str, ...]) -> list[int]:
-    """Indices of named observations, all of them if `at` is empty.
+    """Indices of named observations, in the order of `at`; all of them if it is empty.
 
     Raises:
         ValueError: For a name that the task does not observe.
@@ -17,7 +17,7 @@ def columns(task: AbstractTask, at: tuple[str, ...]) -> list[int]:
     for name in at:
         if name not in task.observation_names:
             raise ValueError(f"{task.name} observes no {name!r}. It observes: {', '.join(task.observation_names)}.")
-    return [i for i, name in enumerate(task.observation_names) if not at or name in at]
+    return [task.observation_names.index(name) for name in at] if at else list(range(len(task.observation_names)))
 
 
 @dataclass(frozen=True)

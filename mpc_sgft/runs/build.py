@@ -85,12 +85,13 @@ def make_env(
 
 
 def draws_of(cfg: DictConfig) -> dict[str, randomize.Draw]:
-    """The draws of `cfg.randomize` by their names.
+    """The draws of `cfg.randomize` by their names; one that is null is left out.
 
     Raises:
         ValueError: For one that is not allowed.
     """
     entries = OmegaConf.to_container(cfg.randomize.draws, resolve=True)
+    entries = {name: draw for name, draw in entries.items() if draw is not None}  # type: ignore[union-attr]
     draws = randomize.load(entries)  # type: ignore[arg-type]
     return dict(zip(entries, draws, strict=True))  # type: ignore[arg-type]
 

@@ -144,6 +144,38 @@ def test_a_sliding_puck_stops_after_v_squared_over_two_mu_g(make_task, mu) -> No
     assert abs(data.qvel[7]) < 1e-3
 
 
+def test_a_slippery_table_is_slippery_for_a_puck_that_decides_in_its_contacts(make_task) -> None:
+    task, slid = make_task("push"), {}
+    for mu in (0.05, 0.3):
+        model, data = _scene(task, {"contact_friction": {"coefficient": mu, "at": ["table"]}}, task.home()[0])
+        speed, start = 0.4, data.qpos[7].copy()
+        data.qvel[7:] = [speed, 0, 0, 0, 0, 0]
+        mujoco.mj_step(model, data, nstep=round(4 * speed / (mu * 9.81) / task.sim_dt))
+        slid[mu] = (data.qpos[7] - start) / (speed**2 / (2 * mu * 9.81))
+    assert slid == pytest.approx({0.05: 1.0, 0.3: 1.0}, rel=0.08)
+
+
+def test_a_soft_table_is_soft_under_a_puck_that_decides_in_its_contacts(make_task) -> None:
+    task, depth = make_task("push"), {}
+    for at in ("table", "puck"):
+        _, data = _scene(task, {"contact_softness": {"time_constant": 0.05, "at": [at]}}, task.home()[0])
+        depth[at] = data.qpos[9]
+    assert depth["table"] == pytest.approx(depth["puck"], abs=1e-5)
+
+
+def test_a_payload_that_nothing_moves_is_refused(make_task) -> None:
+    """The puck of the towel task is soft: its nodes move, the body that bears its name does not."""
+    spec = make_task("push_towel").spec()
+    (load,) = effects.load({"payload": {"mass": 1.0, "at": ["puck"]}})
+    with pytest.raises(ValueError, match="payload at 'puck': nothing moves this body"):
+        load.edit_spec(spec)
+
+
+def test_two_payloads_at_one_body_add_up() -> None:
+    model, _ = _world(FREE, {"payload": [{"mass": 1.0, "at": ["cart"]}, {"mass": 2.0, "at": ["cart"]}]})
+    assert model.body_subtreemass[model.body("cart").id] == pytest.approx(2 + 3)
+
+
 def test_contact_friction_decides_over_the_other_geom() -> None:
     slope = """
     <mujoco><option gravity="3 0 -9.3"/><worldbody>

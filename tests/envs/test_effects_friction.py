@@ -218,6 +218,19 @@ def test_load_dependent_friction_in_the_task_s_own_simulation(make_backend) -> N
     assert speeds["driven", "with"] == pytest.approx(0.7 * speeds["driven", "without"], rel=0.02)
 
 
+@pytest.mark.parametrize("play", [{"backlash": {"gap": 1e-4}}, {"flexible_joint": {"compliance": 1e-6}}])
+def test_the_load_of_a_joint_is_that_of_its_rotor(make_backend, play) -> None:
+    added = {}
+    for name, gap in (("alone", {}), ("beside", play)):
+        backend = make_backend("push", 1, effects_={"load_dependent_friction": {"coefficient": 0.2}} | gap)
+        backend.reset(np.arange(1))
+        own = backend.dry.own.copy()
+        backend.send(np.ones((1, 2)))
+        added[name] = (backend.dry.level - own)[0, :7]
+    np.testing.assert_allclose(added["beside"], added["alone"], rtol=0.3, atol=0.3)
+    assert added["alone"].max() > 1
+
+
 def test_load_dependent_friction_does_not_outlive_an_episode(make_backend) -> None:
     backend = make_backend("push", 2, effects_={"load_dependent_friction": {"coefficient": 0.2}})
     backend.reset(np.arange(2))

@@ -22,6 +22,17 @@ def _episode(make_backend, gap, steps=6, **kwargs):
     return backend, np.stack(seen), states
 
 
+@pytest.mark.parametrize("gap", [{"sensor_offset": {"offset": [0.3, -0.1]}}, {"sensor_gain": {"gain": [0.3, -0.1]}}])
+def test_each_name_has_its_own_number_whatever_their_order(make_backend, gap) -> None:
+    """In simulation as in recorded data, where `measured` goes by the name."""
+    (name, numbers), names = *gap.items(), ["puck_x", "tip_y"]
+    (effect,) = load({name: numbers | {"at": names}})
+    plain, seen = (_episode(make_backend, table, steps=2)[1] for table in ({}, {name: numbers | {"at": names}}))
+    for column, observed in enumerate(["tip_x", "tip_y", "puck_x", "puck_y"]):
+        told = effect.measured(plain[..., column], observed, np.zeros(len(plain)))
+        np.testing.assert_allclose(seen[..., column], told, atol=1e-12)
+
+
 def test_offset_is_added_to_what_it_names(make_backend) -> None:
     plain, seen = (
         _episode(make_backend, gap)[1]

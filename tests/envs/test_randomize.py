@@ -200,6 +200,36 @@ def test_a_missing_key_is_named() -> None:
         randomize.load({"mass": {"fields": ["body_mass"], "low": 1.0}})
 
 
+@pytest.mark.parametrize(
+    "gap",
+    [
+        {"gravity_tilt": {"roll": 0.05}},
+        {"stribeck_friction": {"coulomb": 0.1, "static": 0.2}},
+        {"backlash": {"gap": 0.02, "at": ["joint1"]}},
+        {"joint_stiffness": {"stiffness": 1.0, "at": ["joint1"]}},
+    ],
+    ids=lambda gap: next(iter(gap)),
+)
+@pytest.mark.parametrize("task", ["push", "rope_peg_in_hole"])
+def test_what_effects_add_to_a_scene_is_not_drawn(make_backend, gap, task) -> None:
+    """Actuators without an input have no history that a latency fits in, and a play is no rope."""
+    table = dict(LATENCY)
+    if task == "rope_peg_in_hole":
+        table |= {"rope": {"fields": ["tendon_range[1]"], "operation": "scale", "low": 0.5, "high": 0.5}}
+    plain, backend = (make_backend(task, 1, effects_=effects_, draws=table) for effects_ in ({}, gap))
+    for each in (plain, backend):
+        each.reset(np.arange(1))
+    for name, drawn in _drawn(plain).items():
+        there, own = _drawn(backend)[name][0], len(drawn[0])
+        np.testing.assert_allclose(there[:own], drawn[0])
+        np.testing.assert_allclose(there[own:], np.array(getattr(backend.model, name))[own:])
+
+
+def test_a_bare_name_is_a_list_of_one() -> None:
+    (draw,) = randomize.load({"mass": {"fields": "body_mass", "at": "puck", "low": 1.0, "high": 2.0}})
+    assert (draw.fields, draw.at) == (("body_mass",), ("puck",))
+
+
 def test_a_free_joint_has_six_degrees_of_freedom(make_backend) -> None:
     table = {"drag": {"fields": ["dof_damping"], "at": ["puck"], "operation": "set", "low": 0.7, "high": 0.7}}
     backend = make_backend("push", 2, draws=table)

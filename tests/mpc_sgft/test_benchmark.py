@@ -85,6 +85,11 @@ def test_the_simulator_is_drawn_anew_each_episode() -> None:
     assert not env.env.backend.randomizer.arrays, "there is one reality"
 
 
+def test_the_simulator_starts_as_pretraining_does() -> None:
+    task = gymnasium.make("mpc_sgft/push-sim-v0").unwrapped.env.task
+    assert task.stray_share == compose("pretrain", ["task=push"], []).task.in_training.stray_share > 0
+
+
 def test_a_policy_that_knows_the_gap_scores_and_one_that_does_not_fails() -> None:
     task = build.make_env(compose("evaluate", [], []), 1).task
 

@@ -43,3 +43,8 @@ def test_a_simulated_reality_rewards_what_is_observed_where_that_is_asked_for() 
         assert build.make_env(compose.compose(name, given, []), 1).backend.believes is believes
     with pytest.raises(UserError, match="^simulation: backend.reward='seen'; allowed: truth, observed"):
         build.make_env(compose.compose("evaluate", ["backend.reward=seen"], []), 1)
+
+
+def test_a_draw_that_is_null_is_left_out() -> None:
+    cfg = compose.compose("pretrain", ["task=push", "randomize.draws.mass=null"], [])
+    assert set(build.draws_of(cfg)) == set(cfg.randomize.draws) - {"mass"}
