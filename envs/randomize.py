@@ -156,7 +156,7 @@ class Randomizer:
 
 
 def _locate(model: mujoco.MjModel, field: str, at: tuple[str, ...]) -> tuple[str, list[int], int | None]:
-    """(field name, row indices, column) of 'geom_friction[0]' at the named rows; of all but effects' own without names."""
+    """(name, rows, column) of the field 'geom_friction[0]' at what is named; without names, of all but added ones."""
     match = re.fullmatch(r"(\w+?)(?:\[(\d+)\])?", field)
     name = match[1] if match else field
     if not match or not hasattr(model, name):

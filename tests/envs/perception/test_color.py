@@ -42,6 +42,32 @@ def test_a_red_puck_is_found_within_five_millimetres(red):
     assert found is not None and np.linalg.norm(found - puck) < 0.005, found - puck
 
 
+def hidden(frame: Frame, lens, camera, puck, cut) -> Frame:
+    """A frame in which something grey covers points of the puck of which `cut(x, y)`, from its centre, is true."""
+    v, u = np.nonzero(frame.depth > 0)
+    rays = lens.rays(np.column_stack([u, v]).astype(float)) * frame.depth[v, u, None]
+    x, y = (rays @ camera[:3, :3].T + camera[:3, 3] - puck)[:, :2].T
+    color = frame.color.copy()
+    covered = cut(x, y)
+    color[v[covered], u[covered]] = 128
+    return frame._replace(color=color)
+
+
+@pytest.mark.parametrize(
+    "cut",
+    [lambda x, y: x > 0.01, lambda x, y: y < -0.01, lambda x, y: x + y > 0.014, lambda x, y: abs(y - 0.003) < 0.01],
+    ids=["side", "front", "corner", "a bar across"],
+)
+def test_a_puck_of_which_a_part_is_hidden_is_not_taken_for_a_whole_one(red, cut):
+    camera, lens, frames, puck = red
+    seen = ColorBlob(**SETTINGS | {"diameter": 0.05}).find(frames[0], lens, camera)
+    assert seen is not None and np.linalg.norm(seen - puck) < 0.005
+    part = hidden(frames[0], lens, camera, puck, cut)
+    any_size = ColorBlob(**SETTINGS).find(part, lens, camera)
+    assert any_size is not None and np.linalg.norm(any_size - puck) > 0.005, "where the middle of the rest is"
+    assert ColorBlob(**SETTINGS | {"diameter": 0.05}).find(part, lens, camera) is None
+
+
 def test_what_is_outside_the_box_does_not_count(red):
     camera, lens, frames, puck = red  # the other puck is nearer and so larger in the picture
     box = {"low": (0.3, -0.1, 0.005), "high": (0.9, 0.4, 0.1)}
@@ -71,6 +97,7 @@ def test_no_puck_no_depth_or_another_colour_is_none(red):
         ({"hsv_low": (0, 200, 0), "hsv_high": (10, 100, 255)}, "must not exceed"),
         ({"low": (0.9, 0, 0), "high": (0.3, 1, 1)}, "inside out"),
         ({"top": 0.0}, "must be positive"),
+        ({"diameter": 0.0}, "diameter=0.0 m must be positive"),
     ],
 )
 def test_wrong_settings_are_named(change, message):
