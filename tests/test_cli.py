@@ -113,6 +113,7 @@ def test_groups_and_effects_are_the_files_on_disk() -> None:
         (["seed=1,2"], ["Add -m"]),
         (["task=null"], ["one task is needed"]),
         (["randomize=push"], ["deploy has no randomize="]),
+        (["randomize.draws.x.low=0.3"], ["randomize.draws.x.low: deploy has no randomize", "gap"]),
         (["--bakend", "sim"], ["unknown flag '--bakend'", "--backend"]),
         (["--seed"], ["--seed", "expected one argument"]),
         (["push"], ["key=value"]),
@@ -129,6 +130,26 @@ def test_what_does_not_exist_is_one_line_and_exit_2(args: list[str], parts: list
     assert error.startswith("error: ") and error.count("\n") == 1, error
     for part in parts:
         assert part in error
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        ("randomize.noise=0.5", "unknown key of randomize 'noise'"),
+        ("randomize.mass.low=0.5", "unknown key of randomize 'mass'"),
+        ("randomize=found.yaml", "unknown key of randomize 'noise_sdd'"),
+        ("train.replay.capacity=60", "a round of 80 transitions does not fit train.replay.capacity=60"),
+        ("train.replay.slice_len=50", "slice_len=50: an episode has 1 to 20 steps"),
+        ("planner.num_candidates=6", "num_elites"),
+    ],
+)
+def test_pretraining_says_what_is_wrong_before_it_begins(words: str, says: str, loops: Path, capsys) -> None:
+    from mpc_sgft import pretrain
+
+    Path("found.yaml").write_text("{noise_sdd: 0.5, draws: {}}")
+    tiny = ["+experiment=debug", "task=pendulum", "task.env.episode_steps=20", "num_envs=4", "--quiet"]
+    assert pretrain.main([*tiny, "run_dir=run", words]) == 2
+    assert says in capsys.readouterr().err and not Path("run/checkpoint").exists()
 
 
 @pytest.mark.parametrize("name", COMMANDS)
@@ -230,6 +251,9 @@ def test_resume_takes_the_saved_config_and_its_folder(loops: Path, capsys) -> No
     assert cli.run(probe("show"), ["--resume", "first"]) == 0
     assert cli.run(probe("folder"), ["--resume", "first"]) == 0
     assert capsys.readouterr().out.split("\n")[1:3] == ["7 none 2", str(loops / "first")]
+    assert cli.run(probe("folder"), ["--resume", "first", "horizon=3"]) == 0
+    assert cli.run(probe("show"), ["--resume", "first"]) == 0  # what it was told holds from then on
+    assert capsys.readouterr().out.split("\n")[1] == "7 none 3"
 
 
 def test_a_gap_may_be_a_file(loops: Path, capsys) -> None:
@@ -281,7 +305,10 @@ def test_a_gap_file_that_is_none(text: str | None, words: str, loops: Path, caps
     assert words in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("change", ["task=pendulum", "seed=1", "gap.effects.payload.mass=1", "run_dir=other"])
+@pytest.mark.parametrize(
+    "change",
+    ["task=pendulum", "seed=1", "gap.effects.payload.mass=1", "run_dir=other", "model.mlp_dim=16", "method.lr=1e-5"],
+)
 def test_resume_refuses_to_become_another_run(change: str, loops: Path, capsys) -> None:
     assert cli.run(probe("folder"), ["run_dir=first"]) == 0
     assert cli.run(probe("show"), ["--resume", "first", change]) == 2

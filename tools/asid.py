@@ -48,7 +48,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    for name, plain, left in zip(cfg.randomize.draws, found.plain.tolist(), found.left.tolist(), strict=True):
+    for name, plain, left in zip(build.draws_of(cfg), found.plain.tolist(), found.left.tolist(), strict=True):
         print(f"# {name}: sd {left:.3f} of its range expected after one rollout; of the policy alone {plain:.3f}")
     print(" ".join(overrides(found, args.rollouts)))
     return 0

@@ -82,7 +82,9 @@ def run(command: Command, argv: Sequence[str] | None = None) -> int:
             raise
         return _fail(message, 2)
     except FloatingPointError as err:
-        return _fail(f"{err} Stopped; the last checkpoint of the run is good, --resume goes on from there.", 3)
+        return _fail(
+            f"{err} Stopped; where a checkpoint of the run was saved it is good, and --resume goes on from there.", 3
+        )
     except Stopped as stop:
         print(f"\n{stop}", file=sys.stderr)
         return 130

@@ -32,7 +32,9 @@ RENAMED = {  # beginnings of overrides that had another name
     "train.agent.command_": "method.command_",
 }
 FILES = {"gap": "effects", "randomize": "draws"}  # groups that a file may stand for, and the mapping that it must hold
-OPEN = ("gap.effects.", "randomize.")  # mappings that may gain keys on the command line
+OPEN = ("gap.effects.", "randomize.draws.")  # mappings that may gain keys on the command line
+STORED = ("model.", "train.replay.")  # what a checkpoint holds has these sizes
+OPTIMISED = {"lr", "policy_lr", "command_lr", "observation_lr", "encoder_lr_share", "entropy_lr"}  # it holds these, too
 FORM = re.compile(r"(?P<sign>\+\+|\+|~)?(?P<key>[A-Za-z_][\w./@-]*)(?P<rest>=.*)?", re.DOTALL)
 
 
@@ -124,6 +126,8 @@ def check(name: str, overrides: Sequence[str], values: Mapping[str, Sequence[str
         if key in groups or key.startswith(("hydra.", "hydra/")):
             continue
         if not override.is_delete() and key.startswith(OPEN):
+            if (group := key.partition(".")[0]) not in groups:
+                raise UserError(f"{key}: {name} has no {group}. Its groups: {', '.join(groups)}.")
             continue
         _check_key(base, key)
         for word in _values(override) if key in values else []:
@@ -219,7 +223,8 @@ def resume(name: str, folder: str, overrides: Sequence[str], given: Sequence[str
         key = override.key_or_group
         if (
             key in (*choices.groups(), "run_dir", "checkpoint", "seed", "eval_seed")
-            or key.startswith("gap.")
+            or key.startswith(("gap.", *STORED))
+            or key.rpartition(".")[2] in OPTIMISED
             or override.is_delete()
         ):
             raise UserError(f"{key!r} cannot change in a resumed run. Start a new one, or leave it out.")

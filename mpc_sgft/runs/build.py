@@ -96,6 +96,18 @@ def draws_of(cfg: DictConfig) -> dict[str, randomize.Draw]:
     return dict(zip(entries, draws, strict=True))  # type: ignore[arg-type]
 
 
+def load_state(path: Path) -> dict[str, Any]:
+    """The exact state of a run that is resumed.
+
+    Raises:
+        UserError: If it is damaged.
+    """
+    try:
+        return checkpoint.load_state(path)
+    except checkpoint.CheckpointError as error:
+        raise UserError(str(error)) from error
+
+
 def make_curriculum(cfg: DictConfig) -> "Doraemon | None":
     """What widens the ranges of `cfg.randomize` while pretraining goes on; None if nothing does.
 
@@ -105,7 +117,7 @@ def make_curriculum(cfg: DictConfig) -> "Doraemon | None":
     if cfg.curriculum.get("_target_") is None:
         return None
     with from_config("curriculum"):
-        return instantiate(cfg.curriculum, draws=len(cfg.randomize.draws))
+        return instantiate(cfg.curriculum, draws=len(draws_of(cfg)))
 
 
 def drawn_ranges(draws: Mapping[str, randomize.Draw], shapes: Tensor) -> dict[str, list[float]]:

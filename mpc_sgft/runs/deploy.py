@@ -308,7 +308,7 @@ class Deployment:
     def _resume(self) -> None:
         path = self.folder / "checkpoint" / "state.pt"
         if path.exists():
-            stored = checkpoint.load_state(path)
+            stored = build.load_state(path)
             if any("episode" not in verdict for verdict in stored["transfer"]["verdicts"]):
                 raise UserError(
                     f"cannot resume {self.cfg.resume}: an earlier version wrote it (it did not keep which rollouts "

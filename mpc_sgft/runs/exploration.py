@@ -78,7 +78,7 @@ def explore(
     Raises:
         UserError: If nothing is drawn, or the model does not fit the task.
     """
-    draws = len(cfg.randomize.draws)
+    draws = len(build.draws_of(cfg))
     if not draws:
         raise UserError(
             f"randomize={cfg.chosen.randomize} draws nothing, so there is nothing to learn. Give another one."

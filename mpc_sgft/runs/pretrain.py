@@ -18,6 +18,8 @@ from envs.backends.sim import cores
 from envs.env import ControlEnv
 from mpc_sgft.command.errors import Stopped, UserError, from_config
 from mpc_sgft.learning.agent import Agent
+from mpc_sgft.learning.buffer import SliceBuffer
+from mpc_sgft.learning.row_buffer import RowBuffer
 from mpc_sgft.runs import build
 from mpc_sgft.runs.collect import Act, collect, planner_policy, score, shown, succeeded
 from mpc_sgft.runs.explore import Collected, Round, policy_weights
@@ -38,14 +40,15 @@ def pretrain(cfg: DictConfig) -> int:
     if not cfg.train.privileged:
         agent.imagined_steps = cfg.imagined_steps
     curriculum = build.make_curriculum(cfg)
-    buffer = instantiate(cfg.train.replay, seed=cfg.seed, device=agent.device)
+    planner = build.make_planner(cfg, judge.action_dim)  # what is wrong with it shows now, not after hours
+    buffer = make_buffer(cfg, agent.device, judge.task.episode_steps)
     state = {"round": 0, "updates": 0, "transitions": 0, "episodes": 0, "seconds": 0.0, "streak": 0, "unstable": 0}
     watch = Stopwatch("wait", "update", "evaluate", "save")
     saved = folder / "checkpoint" / "state.pt"
     if cfg.resume is not None:
         if not saved.is_file():
             raise UserError(f"{folder} holds no checkpoint yet: nothing to resume. Start it again with run_dir=...")
-        stored = checkpoint.load_state(saved)
+        stored = build.load_state(saved)
         state, watch.spent = stored["loop"], stored["spent"]
         agent.load_state_dict(stored["agent"])
         buffer.load_state_dict(stored["buffer"])
@@ -84,7 +87,8 @@ def pretrain(cfg: DictConfig) -> int:
     if cfg.resume is not None:
         order, ahead = Round(*stored["order"]), stored["ahead"] and Collected.of(stored["ahead"])
     if ahead is None and state["transitions"] < cfg.transitions:
-        collector.start(order)
+        with watch("wait"):
+            collector.start(order)
     while state["transitions"] < cfg.transitions:
         with watch("wait"):
             found, ahead = ahead or collector.result(), None
@@ -97,7 +101,8 @@ def pretrain(cfg: DictConfig) -> int:
         widened = curriculum.record(found.places, succeeded(data), found.shapes) if curriculum and found.shapes else {}
         order = plan_round(state["round"] + 1)
         if state["transitions"] < cfg.transitions:
-            collector.start(order)
+            with watch("wait"):
+                collector.start(order)  # `collector=inline` collects here
         metrics: dict[str, float] = {"train_success": score(data).success, **widened}
         agent.scale_learning_rates(0.5 ** (state["transitions"] / cfg.lr_halves_every))
         if cfg.hold_value:
@@ -132,8 +137,8 @@ def pretrain(cfg: DictConfig) -> int:
     save()
     collector.close()
     bar.close()
+    stop.restore()
     final_judge = build.make_env(cfg, cfg.final_episodes, randomised=True)
-    planner = build.make_planner(cfg, judge.action_dim)
     torch.set_num_threads(max(cfg.torch_threads, free_threads()))  # nothing else works now
     policies = [prior(agent)]
     if cfg.chosen.planner != "policy":
@@ -164,6 +169,23 @@ def pretrain(cfg: DictConfig) -> int:
     logger.close()
     print(json.dumps(summary))
     return 0
+
+
+def make_buffer(cfg: DictConfig, device: torch.device, episode_steps: int) -> SliceBuffer | RowBuffer:
+    """An empty replay buffer.
+
+    Raises:
+        UserError: If it cannot hold a round, or no episode holds one of its slices.
+    """
+    replay, steps = cfg.train.replay, cfg.num_envs * episode_steps
+    if steps > replay.capacity:
+        raise UserError(
+            f"num_envs={cfg.num_envs}: a round of {steps} transitions does not fit train.replay.capacity="
+            f"{replay.capacity}. Give more capacity, or fewer environments."
+        )
+    if not 1 <= replay.slice_len <= episode_steps:
+        raise UserError(f"train.replay.slice_len={replay.slice_len}: an episode has 1 to {episode_steps} steps.")
+    return instantiate(replay, seed=cfg.seed, device=device)
 
 
 def evaluation_seed(cfg: DictConfig) -> int:
@@ -239,5 +261,9 @@ class StopRequest:
 
     def _ask(self, number: int, frame: FrameType | None) -> None:
         self.asked = True
-        signal.signal(signal.SIGINT, self._before)
+        self.restore()
         print(f"\nstopping after this {self.unit}; once more stops at once", flush=True)
+
+    def restore(self) -> None:
+        """Ctrl-C does what it did before."""
+        signal.signal(signal.SIGINT, self._before)

@@ -40,7 +40,7 @@ def start(cfg: DictConfig, root: Path | str = "runs") -> Path:
         UserError: If the folder already holds something, or cannot be written.
     """
     if cfg.resume is not None:
-        return Path(cfg.resume).resolve()
+        return _resumed(cfg)
     root = Path(root).resolve()
     task = str(cfg.chosen.task)
     folder = None
@@ -55,6 +55,17 @@ def start(cfg: DictConfig, root: Path | str = "runs") -> Path:
     if folder.is_relative_to(root):
         for link in (root / "latest", root / task / "latest"):
             _link(link, folder)
+    return folder
+
+
+def _resumed(cfg: DictConfig) -> Path:
+    """The folder of a run that goes on; what it is told now goes into its config.yaml, and so holds the next time."""
+    folder = Path(cfg.resume).resolve()
+    told = OmegaConf.to_yaml(OmegaConf.merge(cfg, {"resume": None}), resolve=True)
+    try:
+        write_whole(folder / "config.yaml", told.encode())
+    except OSError as err:
+        raise UserError(disk_error(err) or f"{err.filename}: {err.strerror}.") from err
     return folder
 
 
