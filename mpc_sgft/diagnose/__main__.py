@@ -169,6 +169,7 @@ def _run_folder(args: argparse.Namespace) -> int:
             raise UserError(f"--{name} does not go with --run, which brings its own scene and episodes; leave it out.")
     if args.retrain_transitions < 1:
         raise UserError(f"--retrain-transitions {args.retrain_transitions}: a whole number from 1 on.")
+    args.run = args.run.resolve()  # runs/latest moves as soon as another run begins
     out = args.out or args.run / "diagnosis"
     if args.retrain:
         from mpc_sgft.diagnose.deployments.retrain import outcome, retrain, table

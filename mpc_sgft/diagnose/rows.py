@@ -163,6 +163,11 @@ def candidate_rows(
     return out
 
 
+def fallen(before: Array, after: Array) -> Array:
+    """By which share roots of mean squares fell; 0 where there was nothing before and after."""
+    return np.where((before == 0) & (after == 0), 0.0, 1 - np.sqrt(after / np.maximum(before, 1e-300)))
+
+
 def reduction(signal: str, unit: str, before: Array, after: Array, rng: np.random.Generator) -> dict[str, Any]:
     """Root mean square error of one signal before and after, and by how much it fell, with its 90 % interval.
 
@@ -172,7 +177,7 @@ def reduction(signal: str, unit: str, before: Array, after: Array, rng: np.rando
         rng: For the bootstrap.
     """
     picks = rng.integers(0, len(before), (judge.RESAMPLES, len(before)))
-    drops = 1 - np.sqrt(after[picks].mean(1) / np.maximum(before[picks].mean(1), 1e-300))
+    drops = fallen(before[picks].mean(1), after[picks].mean(1))
     low, high = np.quantile(drops, [0.05, 0.95])
     rms = [float(np.sqrt(x.mean())) for x in (before, after)]
     return {
@@ -181,7 +186,7 @@ def reduction(signal: str, unit: str, before: Array, after: Array, rng: np.rando
         "windows": len(before),
         "nominal": rms[0],
         "repaired": rms[1],
-        "reduction": 1 - rms[1] / max(rms[0], 1e-300),
+        "reduction": float(fallen(before.mean(), after.mean())),
         "low": float(low),
         "high": float(high),
     }

@@ -89,7 +89,7 @@ def _inertial(spec: mujoco.MjSpec, plant: Plant, name: str, place: str, factor: 
     m, body = plant.model, spec.body(place)
     i = m.body(place).id
     mass, position, inertia = float(m.body_mass[i]), np.array(m.body_ipos[i]), np.array(m.body_inertia[i])
-    if body.explicitinertial:  # another quantity of this body was scaled before
+    if body.explicitinertial and np.isnan(body.fullinertia[0]):  # also if another quantity of it was scaled before
         mass, position, inertia = float(body.mass), np.array(body.ipos), np.array(body.inertia)
     if name == "mass":
         mass, inertia = mass * factor, inertia * factor

@@ -21,7 +21,7 @@ from envs.task import AbstractTask, whole_steps
 from mpc_sgft.command.errors import UserError
 from mpc_sgft.diagnose.data.held_commands import MIN_LAG
 from mpc_sgft.diagnose.data.measured import Array
-from mpc_sgft.diagnose.deployments.recordings import Rollout, joint_columns
+from mpc_sgft.diagnose.deployments.recordings import Rollout, columns_of, joint_columns
 
 AT_LIMIT = 1e-4  # of the range of forces
 
@@ -35,14 +35,16 @@ def measured_drive(model: mujoco.MjModel, episode: Rollout) -> Array:
         UserError: If an actuator's force is not of this form.
     """
     before = episode.time - model.opt.timestep
-    out = np.empty_like(episode.force)
+    out, columns = np.empty_like(episode.force), columns_of(model, "qpos")
     for i in range(episode.force.shape[1]):
         joint, gear = model.actuator_trnid[i, 0], model.actuator_gear[i, 0]
         linear = model.actuator_gaintype[i] == int(mujoco.mjtGain.mjGAIN_FIXED)
-        if model.actuator_trntype[i] != int(mujoco.mjtTrn.mjTRN_JOINT) or not linear or joint >= episode.q.shape[1]:
+        at_joint = model.actuator_trntype[i] == int(mujoco.mjtTrn.mjTRN_JOINT)
+        if not at_joint or not linear or int(model.jnt_qposadr[joint]) not in columns:
             name = model.actuator(i).name
             raise UserError(f"actuator {name!r}: diagnose --run needs motors or servos with a fixed gain at a joint.")
-        q, v = (gear * np.interp(before, episode.time, x[:, joint]) for x in (episode.q, episode.v))
+        column = columns.index(int(model.jnt_qposadr[joint]))
+        q, v = (gear * np.interp(before, episode.time, x[:, column]) for x in (episode.q, episode.v))
         b = model.actuator_biasprm[i]
         out[:, i] = (episode.force[:, i] - b[0] - b[1] * q - b[2] * v) / model.actuator_gainprm[i, 0]
     return out

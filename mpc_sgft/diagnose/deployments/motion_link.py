@@ -162,9 +162,8 @@ class Motion:
 
     def _compared(self) -> Index:
         """Physics steps after which joints are compared, counted from 1, [n JOINT_SAMPLES]."""
-        return np.round(np.arange(1, self.windows.samples * JOINT_SAMPLES + 1) * self.substeps / JOINT_SAMPLES).astype(
-            int
-        )
+        after = np.arange(1, self.windows.samples * JOINT_SAMPLES + 1) * self.substeps / JOINT_SAMPLES
+        return np.maximum(np.round(after).astype(int), 1)
 
     def _model(self, effects: list[Effect]) -> mujoco.MjModel:
         edits = [e for e in effects if not acts_on_command(e) and type(e).edit_spec is not Effect.edit_spec]

@@ -37,11 +37,16 @@ def next_experiment(chain: Chain, tied: Sequence[Hypothesis]) -> str:
     ]  # the same starts for all
     outcomes = {}
     for words, change in _proposals().items():
-        action = change(np.resize(chain.commands.action, (len(chain.commands.action), STARTS, chain.task.action_dim)))
+        action = change(repeated(chain.commands.action))
         seen = np.array([_observe(b, action) for b in backends]) / scale
         outcomes[words] = separation(seen)
     otherwise = "measure a force, weigh the object, or put a known load on it"
     return best_of(outcomes, "motions", otherwise)
+
+
+def repeated(action: Array) -> Array:
+    """Actions of STARTS episodes, [T, STARTS, A], of recorded ones [T, E, A], some twice if they are fewer."""
+    return action[:, np.arange(STARTS) % action.shape[1]]
 
 
 def _observe(backend: SimBackend, action: Array) -> Array:

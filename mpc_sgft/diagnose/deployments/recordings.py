@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
@@ -160,7 +161,11 @@ def as_rollout(name: str, episode: Episode, task: AbstractTask) -> Rollout:
 
 def joint_columns(task: AbstractTask, kind: str) -> list[int]:
     """Where the machine's hinges and slides stand in qpos or qvel; what hangs together with no motor is an object."""
-    model = task.spec().compile()
+    return columns_of(task.spec().compile(), kind)
+
+
+def columns_of(model: mujoco.MjModel, kind: str) -> list[int]:
+    """As `joint_columns`, of a task's compiled scene."""
     address = model.jnt_qposadr if kind == "qpos" else model.jnt_dofadr
     kinds, tree = [int(k) for k in SCALAR], model.dof_treeid[model.jnt_dofadr]
     driven = set(tree[model.actuator_trnid[:, 0]].tolist())

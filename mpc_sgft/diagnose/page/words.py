@@ -46,18 +46,22 @@ def sentence(effect: Row) -> str:
     values = {name: float(p["value"]) for name, p in effect["parameters"].items()}
     at = place(effect)
 
-    def with_unit(name: str) -> str:
+    def with_unit(name: str, *, signed: bool = False) -> str:
         unit = effect["parameters"][name]["unit"].split(" or ")
-        amount = values[name] if name in ("rest", "angle", "roll") else abs(values[name])
+        amount = values[name] if signed or name in ("rest", "angle", "roll") else abs(values[name])
         return f"{amount:.3g} {unit[0] if len(unit) == 1 else '/'.join(unit)}".removesuffix(" 1")
+
+    def plain() -> str:
+        parts = ", ".join(f"{n} {with_unit(n, signed=True)}" for n in values)
+        return f"{effect['name'].replace('_', ' ')} at {at}: {parts}"
 
     says = SAYS.get(effect["name"])
     if says is None or not set(values):
-        return f"{effect['name'].replace('_', ' ')} at {at}: " + ", ".join(f"{n} {with_unit(n)}" for n in values)
+        return plain()
     try:
         return says(at, values, with_unit)
     except KeyError:  # an effect's parameter that is held is in no row
-        return f"{effect['name'].replace('_', ' ')} at {at}: " + ", ".join(f"{n} {with_unit(n)}" for n in values)
+        return plain()
 
 
 def place(effect: Row) -> str:

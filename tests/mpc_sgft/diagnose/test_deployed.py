@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import mujoco
 import numpy as np
@@ -16,7 +17,9 @@ from mpc_sgft.command.compose import compose
 from mpc_sgft.command.errors import UserError
 from mpc_sgft.diagnose.__main__ import main
 from mpc_sgft.diagnose.deployed import diagnose_run
+from mpc_sgft.diagnose.deployments.chain import Chain
 from mpc_sgft.diagnose.deployments.command_link import ServoCommands, measured_drive, saturated
+from mpc_sgft.diagnose.deployments.next_recording import repeated
 from mpc_sgft.diagnose.deployments.recordings import joint_columns, read_deployment
 from mpc_sgft.storage.episode_file import read_episode
 
@@ -152,6 +155,53 @@ def test_force_tells_what_reached_the_servos_and_the_recording_does_not(deployed
     assert np.sqrt(np.mean((drive - true) ** 2)) < 1e-3 < 0.05 < np.sqrt(np.mean((drive - meant) ** 2))
     recorded = read_episode(run / "episodes" / "0001.mcap").joints["ctrl"]
     assert np.abs(recorded - meant).max() < 2e-3
+
+
+@pytest.mark.parametrize("task_name", ["cheetah_run", "walker_walk"])
+def test_a_right_simulator_foretells_motors_in_every_step(deployed, task_name: str) -> None:
+    """The cheetah's control step is two physics steps, which no five samples divide; a torque is no place to go to."""
+    chain = Chain(read_deployment(deployed({}, task_name=task_name)), 6, 16)
+    everything = np.arange(len(chain.windows.start))
+    assert (np.abs(chain.predict([()], everything).drive[0] - chain.drive) / chain.drive_scale).max() < 0.1
+    assert chain.joint_scale.max() < 0.02  # [rad]; commands of noise are no noise of joints
+
+
+def test_forces_belong_to_the_joints_of_the_machine_wherever_an_object_stands() -> None:
+    arm = """<body name="link"><joint name="hinge"/><geom size="0.1" mass="1"/></body>"""
+    puck = """<body name="puck" pos="1 0 0"><freejoint/><geom size="0.1" mass="1"/></body>"""
+    t = np.linspace(0, 1, 51)
+    for bodies in (arm + puck, puck + arm):
+        model = mujoco.MjModel.from_xml_string(
+            f"""<mujoco><worldbody>{bodies}</worldbody>
+            <actuator><position name="servo" joint="hinge" kp="10"/></actuator></mujoco>"""
+        )
+        q, u = np.sin(t)[:, None], 0.3
+        episode = SimpleNamespace(time=t, q=q, v=0 * q, force=10 * (u - np.interp(t - 0.002, t, q[:, 0]))[:, None])
+        assert measured_drive(model, episode) == pytest.approx(u)  # pyright: ignore[reportArgumentType]
+
+
+def test_actions_to_try_are_those_of_whole_episodes() -> None:
+    action = np.random.default_rng(0).standard_normal((20, 7, 2))
+    for count in (7, 2):
+        tried = repeated(action[:, :count])
+        assert all(any((tried[:, k] == action[:, e]).all() for e in range(count)) for k in range(tried.shape[1]))
+
+
+def test_a_report_stays_with_the_run_that_was_meant(deployed, tmp_path: Path, monkeypatch) -> None:
+    """runs/latest moves when another run begins, while the search takes minutes."""
+    run, latest = deployed({}), tmp_path / "latest"
+    latest.symlink_to(run)
+    seen = []
+
+    def moved(folder: Path, out: Path, **rest: object) -> None:
+        latest.unlink()
+        latest.symlink_to(tmp_path)
+        seen.extend([folder.resolve(), out.resolve()])
+        raise UserError("enough")
+
+    monkeypatch.setattr("mpc_sgft.diagnose.deployed.diagnose_run", moved)
+    assert main(["--run", str(latest)]) == 2
+    assert seen == [run, run / "diagnosis"]
 
 
 def test_a_cut_episode_is_read_as_far_as_it_is_whole(deployed) -> None:

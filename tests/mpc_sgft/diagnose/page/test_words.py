@@ -26,6 +26,11 @@ def test_every_effect_has_a_sentence_that_stands_for_itself(name: str) -> None:
     assert "elbow" in sentence(effect) or not kind.place
 
 
+def test_numbers_without_words_of_their_own_keep_their_signs() -> None:
+    effect = row("actuator_offset", [], offset_1=(0.05, "rad"), offset_2=(-0.08, "rad"))
+    assert sentence(effect).endswith(": offset_1 0.05 rad, offset_2 -0.08 rad")
+
+
 def test_signs_and_units_are_words() -> None:
     assert sentence(row("payload", ["forearm"], mass=(0.28, "kg"))) == "body forearm carries 0.28 kg more"
     assert sentence(row("payload", ["forearm"], mass=(-0.28, "kg"))) == "body forearm carries 0.28 kg less"
