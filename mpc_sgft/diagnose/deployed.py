@@ -42,7 +42,7 @@ from mpc_sgft.storage.metrics import progress as bar_of
 LENGTH = 6  # control steps in a window
 MOST = 64  # windows
 ASTRAY = 4.0  # mean square of a joint's error, in units of what noise and contacts make: that joint is suspected alone
-UNITS = {"observation": "of the observation", "drive": "of the control", "qpos": "rad"}
+UNITS = {"observation": "of the observation", "drive": "of the control"}  # of a signal; of joints by their kinds
 FAINT = float(np.log1p(1 / 3))  # log(1 + e) of a window: no link of three errs more than noise and contacts make
 EFFORT = Effort(
     beam=(2,),
@@ -239,9 +239,20 @@ def assemble(
 
 def unit_at(model: mujoco.MjModel, term: Term, unit: str) -> str:
     """Of "N m or N", the one that belongs to the joints at which an effect is; both where they differ."""
+    action, _, control = unit.partition(", or ")
+    if control:
+        return "of the control" if term.at else action
     named = [model.joint(name).id for name in term.at if name in {model.joint(i).name for i in range(model.njnt)}]
     kinds = model.jnt_type[named or model.actuator_trnid[:, 0]]
     return unit_of(unit, (kinds == int(mujoco.mjtJoint.mjJNT_SLIDE)).tolist())
+
+
+def unit_of_signal(model: mujoco.MjModel, name: str) -> str:
+    """Of a compared signal; joints turn or slide."""
+    kind, _, part = name.partition("/")
+    if kind != "qpos":
+        return UNITS[kind]
+    return "m" if model.joint(part).type == int(mujoco.mjtJoint.mjJNT_SLIDE) else "rad"
 
 
 def errors_of(chain: Chain, y: Prediction) -> Array:
@@ -278,9 +289,9 @@ def held_out_rows(
     names = [n for group in chain.groups.values() for n in group]
     seen, joints = ((s**2).mean((0, 1)) for s in (chain.observation_scale, chain.joint_scale))
     scale = np.concatenate([seen, np.full(len(chain.groups["drive"]), chain.drive_scale**2), joints])
+    units = [unit_of_signal(chain.motion.model, n) for n in names]
     return [
-        reduction(names[i], UNITS[names[i].split("/")[0]], nominal[:, i], repaired[:, i], rng)
-        for i in np.argsort(-nominal.mean(0) / scale)
+        reduction(names[i], units[i], nominal[:, i], repaired[:, i], rng) for i in np.argsort(-nominal.mean(0) / scale)
     ]
 
 

@@ -263,6 +263,8 @@ def _signals(
 def unit_at(plant: Plant, term: Term, unit: str) -> str:
     """Of "N m or N", the one that belongs to the joint at which an effect is; both where it is at no joint."""
     where = term.at[0] if term.at else ""
+    if ", or of the control" in unit:  # else of an action, and a bare scene has none
+        return "of the control"
     if unit == "of the observation" and where.startswith("qpos/"):
         return _unit(plant, where)
     joint = where.removeprefix("qpos/")

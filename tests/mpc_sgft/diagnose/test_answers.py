@@ -66,7 +66,7 @@ def test_of_names_for_one_term_the_usual_one_is_given(slide: Path, record: Recor
     (tie,) = report["ties"]
     assert tie["effects"] == ["gravity_tilt"] and "spirit level" in tie["reason"]
     offset = report["effects"][0]["parameters"]["offset"]
-    assert offset["low"] <= -0.1 <= offset["high"]
+    assert offset["low"] <= -0.1 <= offset["high"] and offset["unit"] == "of the control"
 
 
 @pytest.mark.parametrize(("what", "factor"), [("mass", 1.2), ("gain", 1 / 1.2)])

@@ -16,13 +16,14 @@ from envs.effects import load
 from mpc_sgft.command.compose import compose
 from mpc_sgft.command.errors import UserError
 from mpc_sgft.diagnose.__main__ import main
-from mpc_sgft.diagnose.deployed import diagnose_run
+from mpc_sgft.diagnose.deployed import diagnose_run, unit_at, unit_of_signal
 from mpc_sgft.diagnose.deployments.chain import Chain
 from mpc_sgft.diagnose.deployments.command_link import ServoCommands, measured_drive, saturated
 from mpc_sgft.diagnose.deployments.next_recording import repeated
 from mpc_sgft.diagnose.deployments.recordings import joint_columns, read_deployment
 from mpc_sgft.storage.episode_file import read_episode
 
+SLIDE, HINGE = mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE
 FEW = ["actuator_gain", "frame_rotation", "actuator_delay", "contact_friction"]
 
 
@@ -178,6 +179,16 @@ def test_forces_belong_to_the_joints_of_the_machine_wherever_an_object_stands() 
         q, u = np.sin(t)[:, None], 0.3
         episode = SimpleNamespace(time=t, q=q, v=0 * q, force=10 * (u - np.interp(t - 0.002, t, q[:, 0]))[:, None])
         assert measured_drive(model, episode) == pytest.approx(u)  # pyright: ignore[reportArgumentType]
+
+
+def test_units_are_those_of_the_place() -> None:
+    model = instantiate(compose("evaluate", ["task=cheetah_run"], []).task.env, _convert_="all").spec().compile()
+    slide, hinge = (model.joint(int(np.flatnonzero(model.jnt_type == int(k))[0])).name for k in (SLIDE, HINGE))
+    names = [f"qpos/{slide}", f"qpos/{hinge}", f"drive/{hinge}"]
+    assert [unit_of_signal(model, n) for n in names] == ["m", "rad", "of the control"]
+    unit = load({"actuator_offset": {}})[0].units["offset"]
+    for at, words in (((), "of the largest action"), (("bthigh",), "of the control")):
+        assert unit_at(model, SimpleNamespace(at=at), unit) == words  # pyright: ignore[reportArgumentType]
 
 
 def test_actions_to_try_are_those_of_whole_episodes() -> None:
