@@ -14,6 +14,7 @@ def test_runs_that_are_there_become_rows(tmp_path, monkeypatch):
     summary |= {"peak_memory_mb": {"learner": 900, "collector": 800}}
     (tmp_path / "push-5").mkdir()
     (tmp_path / "push-5" / "summary.json").write_text(json.dumps(summary))
+    (tmp_path / "push-5.asked").write_text("pretrain\ntask=push\nseed=5\n")
     words = ["--csv", str(tmp_path / "out.csv"), "--runs", str(tmp_path), "--seeds", "5"]
     monkeypatch.setattr(sys, "argv", ["pretrain_study", *words])
     pretrain_study.main()
