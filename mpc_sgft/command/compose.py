@@ -33,8 +33,8 @@ RENAMED = {  # beginnings of overrides that had another name
 }
 FILES = {"gap": "effects", "randomize": "draws"}  # groups that a file may stand for, and the mapping that it must hold
 OPEN = ("gap.effects.", "randomize.draws.")  # mappings that may gain keys on the command line
-STORED = ("model.", "train.replay.")  # what a checkpoint holds has these sizes
-OPTIMISED = {"lr", "policy_lr", "command_lr", "observation_lr", "encoder_lr_share", "entropy_lr"}  # it holds these, too
+STORED = ("model.", "train.replay.", "train.agent.entropy_coef")  # what a checkpoint holds: sizes, what has trained
+OPTIMISED = {"lr", "policy_lr", "command_lr", "observation_lr", "encoder_lr_share", "entropy_lr"}  # its optimisers hold
 FORM = re.compile(r"(?P<sign>\+\+|\+|~)?(?P<key>[A-Za-z_][\w./@-]*)(?P<rest>=.*)?", re.DOTALL)
 
 

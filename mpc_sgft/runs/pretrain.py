@@ -41,7 +41,7 @@ def pretrain(cfg: DictConfig) -> int:
         agent.imagined_steps = cfg.imagined_steps
     curriculum = build.make_curriculum(cfg)
     planner = build.make_planner(cfg, judge.action_dim)  # what is wrong with it shows now, not after hours
-    buffer = make_buffer(cfg, agent.device, judge.task.episode_steps)
+    buffer = start_buffer(cfg, agent.device, judge.task.episode_steps)
     state = {"round": 0, "updates": 0, "transitions": 0, "episodes": 0, "seconds": 0.0, "streak": 0, "unstable": 0}
     watch = Stopwatch("wait", "update", "evaluate", "save")
     saved = folder / "checkpoint" / "state.pt"
@@ -73,7 +73,7 @@ def pretrain(cfg: DictConfig) -> int:
         parts["curriculum"] = None if curriculum is None else curriculum.state_dict()
         checkpoint.save_state(saved, {**parts, "agent": agent.state_dict(), "buffer": buffer.state_dict()})
 
-    stop = StopRequest("round")
+    stop, go_on = StopRequest("round"), f"python -m mpc_sgft.pretrain --resume {folder}"
     logger = MetricLogger(
         folder,
         csv=cfg.log.csv,
@@ -129,15 +129,15 @@ def pretrain(cfg: DictConfig) -> int:
                 save()
         if stop.asked:
             collector.close()
-            raise Stopped(
-                f"saved after {state['transitions']} transitions. Go on: python -m mpc_sgft.pretrain --resume {folder}"
-            )
+            raise Stopped(f"saved after {state['transitions']} transitions. Go on: {go_on}")
         if done:
             break
     save()
     collector.close()
     bar.close()
     stop.restore()
+    if stop.asked:  # while it saved
+        raise Stopped(f"saved after {state['transitions']} transitions. Only its final evaluation is left: {go_on}")
     final_judge = build.make_env(cfg, cfg.final_episodes, randomised=True)
     torch.set_num_threads(max(cfg.torch_threads, free_threads()))  # nothing else works now
     policies = [prior(agent)]
@@ -171,7 +171,7 @@ def pretrain(cfg: DictConfig) -> int:
     return 0
 
 
-def make_buffer(cfg: DictConfig, device: torch.device, episode_steps: int) -> SliceBuffer | RowBuffer:
+def start_buffer(cfg: DictConfig, device: torch.device, episode_steps: int) -> SliceBuffer | RowBuffer:
     """An empty replay buffer.
 
     Raises:

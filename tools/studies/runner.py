@@ -66,18 +66,16 @@ def finished(
 
 
 def asked_before(folder: Path, words: Sequence[str]) -> None:
-    """Note beside a folder what is asked of it, the first time.
+    """Note beside a folder that is not there yet what is asked of it; one that is must have been asked the same.
 
     Raises:
-        RunFailed: If that was something else then, or it was not noted.
+        RunFailed: If that was something else, or was not noted.
     """
     kept = folder.with_name(f"{folder.name}.asked")
-    if kept.exists():
-        before = kept.read_text().splitlines()
-    else:
-        before = ["unknown settings"] if folder.exists() else [*words]
-        if before == [*words]:
-            write_whole(kept, "".join(f"{word}\n" for word in words).encode())
+    if not folder.exists():
+        write_whole(kept, "".join(f"{word}\n" for word in words).encode())
+        return
+    before = kept.read_text().splitlines() if kept.exists() else ["unknown settings"]
     if before != [*words]:
         raise RunFailed(
             f"{folder} was made with {' '.join(before)}, asked for is {' '.join(words)}. "

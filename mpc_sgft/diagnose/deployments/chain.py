@@ -188,14 +188,11 @@ class Chain:
         joints, seen = (np.max(mine, 0) for mine in spread)  # a typical start, the worst friction
         self.joint_floor, self.observation_floor = np.median(joints, (0, 1)), np.median(seen, (0, 1))
         noise = np.median([[noise_of(q) for q in e.q.T] for e in self.episodes], 0)
-        shaken = max(float(np.median([noise_of(u) for u in x.T])) for x in measured) if self._follows() else 0.0
+        servos = m.model.actuator_biasprm[:, 1] < 0  # go where they are told, and so follow the noise of it
+        shaken = max(float(np.median([noise_of(u) for u in x[:, servos].T])) for x in measured) if servos.any() else 0.0
         self.joint_scale = np.sqrt(joints**2 + noise**2 + JOINT_RESOLUTION**2 + shaken**2)
         self.observation_scale = np.sqrt(seen**2 + RESOLUTION**2 + self.noise**2)
         self.drive_scale = DRIVE_SHARE * float(np.std(np.concatenate(measured), axis=0).max()) + 1e-9
-
-    def _follows(self) -> bool:
-        """Whether controls are places that servos go to, so that joints follow the noise of them."""
-        return bool((self.task.spec().compile().actuator_biasprm[:, 1] < 0).any())
 
 
 def friction_variants(task: AbstractTask) -> list[tuple[Effect, ...]]:

@@ -54,6 +54,8 @@ def test_a_failure_is_told_and_the_others_go_on(tmp_path, capsys):
     assert "tsak" in capsys.readouterr().err
     with pytest.raises(RunFailed, match="exit code 2"):
         work("bad")
+    with pytest.raises(RunFailed, match="unknown task 'pusch'"):  # nothing was made: other words may be tried there
+        finished("pretrain", tmp_path / "bad", ["task=pusch"])
 
 
 def test_rows_are_on_disk_as_they_come_and_not_measured_twice(tmp_path):
