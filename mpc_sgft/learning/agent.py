@@ -84,7 +84,8 @@ class Agent:
         }
         self.products = dtype_of_products(precision, int(model.sizes["mlp_dim"]), self.device)
         self.generator = torch.Generator(self.device).manual_seed(seed)
-        self.scale = losses.RunningScale(scale_rate, self.device)
+        self.scale = losses.RunningScale(scale_rate, self.device)  # of values
+        self.objective_scale = losses.RunningScale(scale_rate, self.device)  # of the SGFT objective
         self.log_entropy_coef = torch.tensor(entropy_coef, device=self.device).log().requires_grad_()
         self._averaged = AveragedWeights(self.model, average_decay)
         self.pretraining, self.imagined_steps = True, 0
@@ -205,6 +206,8 @@ class Agent:
     def _update_policy_imagined(self, starts: Tensor, read: bool) -> dict[str, Tensor]:
         coef = self.log_entropy_coef.detach().exp()
         metrics, log_prob = self._climb(starts, self.imagined_steps, coef, read)
+        with torch.no_grad():
+            self.scale.update(self.model.terminal_value(starts))  # what planners will measure values in
         self._tune_entropy(log_prob)
         return metrics | {"entropy_coef": coef}
 
@@ -214,7 +217,7 @@ class Agent:
         noise = self.noise(horizon, len(starts))
         with self._constant_but_policy():
             objective, log_prob = losses.imagined_objective(self.model, starts, noise, self.discount)
-        scale = self.scale.update(objective.detach())
+        scale = self.objective_scale.update(objective.detach())
         metrics = self.step_policy(coef * log_prob.mean() - objective.mean() / scale, log_prob, read)
         return metrics | {"objective": objective.mean(), "scale": scale}, log_prob
 
@@ -288,7 +291,8 @@ class Agent:
     def snapshot(self) -> dict[str, Any]:
         """Copy of what trains: parameters and optimisers. Give it to `restore` to undo updates."""
         state = {name: x.detach().clone() for name, x in self.model.state_dict().items() if self._trains(name)}
-        rest = {"log_entropy_coef": self.log_entropy_coef.detach().clone(), "scale": self.scale.value.clone()}
+        scales = {"scale": self.scale.value.clone(), "objective_scale": self.objective_scale.value.clone()}
+        rest = {"log_entropy_coef": self.log_entropy_coef.detach().clone(), **scales}
         return {"model": state, "optimizers": self.optimizers.state_dict(), **rest}
 
     @torch.no_grad()
@@ -300,6 +304,7 @@ class Agent:
             self._graphs.clear()  # what they read has moved
         self.log_entropy_coef.copy_(snapshot["log_entropy_coef"])
         self.scale.value.copy_(snapshot["scale"])
+        self.objective_scale.value.copy_(snapshot.get("objective_scale", snapshot["scale"]))  # once there was one scale
 
     def frozen_hash(self) -> str:
         """SHA-256 of the names and bytes of every tensor of the model that does not train, in hexadecimal."""

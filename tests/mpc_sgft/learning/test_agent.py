@@ -287,3 +287,19 @@ def test_with_imagined_steps_the_policy_does_not_climb_the_critics(steps):
         torch.equal(a, b) for a, b in zip(*(x.model.policy_head.parameters() for x in (plain, other)), strict=True)
     )
     assert same == (steps > 0)
+
+
+@torch.no_grad()
+def test_with_imagined_steps_values_are_still_measured_by_those_of_states():
+    agent = make_agent(scale_rate=1.0)
+    agent.imagined_steps = 4
+    agent.hold_value(True)  # so that what is measured stays as it is
+    for p in agent.model.value_head.parameters():
+        p.normal_(std=3.0)
+    batch = make_batch()
+    with torch.enable_grad():
+        metrics = agent.update(batch)
+    values = agent.model.terminal_value(agent.model.encode(batch["observation"][:, 0]))
+    low, high = torch.quantile(values, torch.tensor([0.05, 0.95]))
+    assert float(agent.scale.value) == pytest.approx(float(high - low), rel=1e-4) and high - low > 2
+    assert metrics["scale"] == pytest.approx(float(agent.objective_scale.value)) != float(agent.scale.value)
