@@ -107,7 +107,11 @@ def test_groups_and_effects_are_the_files_on_disk() -> None:
         (["train.agent.transfer_lr=1"], ["method.lr=1"]),
         (["method=sgtf"], ["unknown method 'sgtf'", "sgft", "zero_shot"]),
         (["device=gpu"], ["unknown device 'gpu'", "cuda"]),
-        (["seed=one"], ["a number is needed"]),
+        (["seed=one"], ["a whole number is needed"]),
+        (["planner.num_candidates=1e2"], ["a whole number is needed, as in planner.num_candidates="]),
+        (["planner.temperature=hot"], ["a number is needed"]),
+        (["eval_every=0"], ["eval_every=0: a whole number from 1 on"]),
+        (["warmup=-1"], ["warmup=-1: a whole number from 0 on"]),
         (["seed=-1"], ["a whole number"]),
         (["eval_seed=-1"], ["eval_seed=-1: a whole number"]),
         (["seed=1,2"], ["Add -m"]),
@@ -141,6 +145,9 @@ def test_what_does_not_exist_is_one_line_and_exit_2(args: list[str], parts: list
         ("train.replay.capacity=60", "a round of 80 transitions does not fit train.replay.capacity=60"),
         ("train.replay.slice_len=50", "slice_len=50: an episode has 1 to 20 steps"),
         ("planner.num_candidates=6", "num_elites"),
+        ("final_episodes=0", "final_episodes=0: a whole number from 1 on"),
+        ("detours.share=2", "detours.share=2: a share"),
+        ("detours.steps=[5,2]", "detours.steps=[5, 2]: from and to"),
     ],
 )
 def test_pretraining_says_what_is_wrong_before_it_begins(words: str, says: str, loops: Path, capsys) -> None:

@@ -21,6 +21,7 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from mpc_sgft.command import choices
+from mpc_sgft.command.counts import check_counts
 from mpc_sgft.command.errors import UserError, unknown
 
 ALIASES = {"horizon": "planner.horizon", "robot-ip": "backend.robot_ip", "dry-run": "backend.dry_run"}
@@ -35,6 +36,14 @@ FILES = {"gap": "effects", "randomize": "draws"}  # groups that a file may stand
 OPEN = ("gap.effects.", "randomize.draws.")  # mappings that may gain keys on the command line
 STORED = ("model.", "train.replay.", "train.agent.entropy_coef")  # what a checkpoint holds: sizes, what has trained
 OPTIMISED = {"lr", "policy_lr", "command_lr", "observation_lr", "encoder_lr_share", "entropy_lr"}  # its optimisers hold
+KINDS: tuple[tuple[type, tuple[type, ...], str], ...] = (  # of a default, and what may stand in its place
+    (bool, (bool,), "true or false"),
+    (int, (int,), "a whole number"),
+    (float, (int, float), "a number"),
+    (str, (str,), "a word"),
+    (list, (list,), "a list"),
+    (ListConfig, (list,), "a list"),
+)
 FORM = re.compile(r"(?P<sign>\+\+|\+|~)?(?P<key>[A-Za-z_][\w./@-]*)(?P<rest>=.*)?", re.DOTALL)
 
 
@@ -159,15 +168,11 @@ def complete(cfg: DictConfig, name: str, chosen: Mapping[str, str | None], given
     """Add `command`, `chosen` (group -> option) and `overrides` to a composed config, and check what only it can show.
 
     Raises:
-        UserError: On an unknown effect, a bad seed, or an interpolation that leads nowhere.
+        UserError: On an unknown effect, a count that is too small, or an interpolation that leads nowhere.
     """
     for effect in OmegaConf.select(cfg, "gap.effects") or {}:
         if effect not in choices.effects():
             raise unknown("effect", str(effect), choices.effects(), "envs/effects/")
-    for key in ("seed", "eval_seed"):
-        value = cfg.get(key, 0)
-        if not isinstance(value, int) or isinstance(value, bool) or value < 0:
-            raise UserError(f"{key}={value}: a whole number from 0 on is needed.")
     bare = [text.lstrip("+") for text in given]
     gap_changes = [text.removeprefix("gap.effects.") for text in bare if text.startswith("gap.effects.")]
     names = {group: option for group, option in chosen.items() if option is not None}
@@ -185,6 +190,7 @@ def complete(cfg: DictConfig, name: str, chosen: Mapping[str, str | None], given
         OmegaConf.resolve(cfg)
     except OmegaConfBaseException as err:
         raise UserError(f"the config cannot be resolved: {first_line(err)}") from err
+    check_counts(cfg)
     OmegaConf.set_struct(cfg, True)
     return cfg
 
@@ -232,6 +238,7 @@ def resume(name: str, folder: str, overrides: Sequence[str], given: Sequence[str
             _check_key(cfg, key)
         _check_kind(OmegaConf.select(cfg, key), override)
         OmegaConf.update(cfg, key, override.value(), force_add=key.startswith(OPEN))
+    check_counts(cfg)
     cfg.resume = cfg.run_dir = str(path)
     cfg.overrides = [*cfg.overrides, *given]
     OmegaConf.set_struct(cfg, True)
@@ -350,10 +357,9 @@ def _check_key(cfg: Any, key: str) -> None:
 
 def _check_kind(default: Any, override: Override) -> None:
     value = override.value()
-    kinds = {bool: "true or false", (int, float): "a number", str: "a word", (list, ListConfig): "a list"}
-    for kind, words in kinds.items():
+    for kind, allowed, words in KINDS:
         if isinstance(default, kind):
-            right = isinstance(value, kind) and (kind is bool or not isinstance(value, bool))
+            right = isinstance(value, allowed) and (kind is bool or not isinstance(value, bool))
             interpolated = isinstance(value, str) and "${" in value
             if not (right or value is None or interpolated or (kind is str and not isinstance(value, dict | list))):
                 raise UserError(f"{override.input_line!r}: {words} is needed, as in {override.key_or_group}={default}.")

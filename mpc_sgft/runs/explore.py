@@ -12,6 +12,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from mpc_sgft.command.compose import compose
+from mpc_sgft.command.errors import UserError
 from mpc_sgft.learning.world_model import WorldModel
 from mpc_sgft.runs import build
 from mpc_sgft.runs.collect import Act, collect, planner_policy, random_policy, shown
@@ -152,6 +153,17 @@ def explorer(model: WorldModel, cfg: DictConfig, num_envs: int, seed: int) -> Ac
         return action
 
     return act
+
+
+def check_exploration(cfg: DictConfig) -> None:
+    """Raise UserError unless detours, and what a task is asked in training alone, can be: no worker has begun yet."""
+    for name in ("share", "rate", "rest"):
+        if not 0 <= cfg.detours[name] <= 1:
+            raise UserError(f"detours.{name}={cfg.detours[name]}: a share, between 0 and 1.")
+    steps = cfg.detours.steps
+    if len(steps) != 2 or not all(isinstance(n, int) for n in steps) or not 0 < steps[0] < steps[1]:
+        raise UserError(f"detours.steps={steps}: from and to (without), two whole numbers, 0 < from < to.")
+    build.make_env(cfg, 1, randomised=True, learning=True).backend.close()
 
 
 def round_seed(seed: int, number: int) -> int:

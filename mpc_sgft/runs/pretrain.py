@@ -22,7 +22,7 @@ from mpc_sgft.learning.buffer import SliceBuffer
 from mpc_sgft.learning.row_buffer import RowBuffer
 from mpc_sgft.runs import build
 from mpc_sgft.runs.collect import Act, collect, planner_policy, score, shown, succeeded
-from mpc_sgft.runs.explore import Collected, Round, policy_weights
+from mpc_sgft.runs.explore import Collected, Round, check_exploration, policy_weights
 from mpc_sgft.storage import checkpoint, run_folder
 from mpc_sgft.storage.metrics import MetricLogger, progress
 from planners.policy import PolicyPlanner
@@ -34,6 +34,7 @@ def pretrain(cfg: DictConfig) -> int:
     """Pretrain until the target success is held or the transitions are spent; returns the exit code."""
     folder = run_folder.start(cfg)
     build.prepare_process(cfg)
+    check_exploration(cfg)
     judge = build.make_env(cfg, cfg.eval_episodes, randomised=True)
     agent = start_agent(cfg, judge)
     round_size = cfg.num_envs * judge.task.episode_steps
@@ -63,13 +64,18 @@ def pretrain(cfg: DictConfig) -> int:
         shapes = None if curriculum is None else tuple(map(tuple, curriculum.shapes.tolist()))
         return Round(number, None if at_random else policy_weights(agent.model), shapes)
 
+    def finished() -> bool:
+        """Whether the transitions are spent, or the target success was held."""
+        held = state["streak"] >= cfg.target_streak and state["transitions"] >= cfg.min_transitions
+        return held or state["transitions"] >= cfg.transitions
+
     def save() -> None:
         """Weights and exact state, at the end of a round."""
         agent.averaged.value_range = float(agent.scale.value)
         meta = checkpoint.describe(cfg, agent.averaged, extra={"transitions": state["transitions"]})
         checkpoint.save(folder / "checkpoint" / "model.safetensors", agent.averaged, meta)
-        ahead = collector.result().state_dict() if state["transitions"] < cfg.transitions else None
-        parts = {"loop": state, "spent": watch.spent, "order": tuple(order), "ahead": ahead}
+        coming = ahead or (collector.result() if state["transitions"] < cfg.transitions else None)
+        parts = {"loop": state, "spent": watch.spent, "order": tuple(order), "ahead": coming and coming.state_dict()}
         parts["curriculum"] = None if curriculum is None else curriculum.state_dict()
         checkpoint.save_state(saved, {**parts, "agent": agent.state_dict(), "buffer": buffer.state_dict()})
 
@@ -86,10 +92,12 @@ def pretrain(cfg: DictConfig) -> int:
     order, ahead = plan_round(0), None
     if cfg.resume is not None:
         order, ahead = Round(*stored["order"]), stored["ahead"] and Collected.of(stored["ahead"])
-    if ahead is None and state["transitions"] < cfg.transitions:
+    if finished():
+        print(f"{folder} is finished: only its final evaluation is made. More training: min_transitions=N")
+    elif ahead is None:
         with watch("wait"):
             collector.start(order)
-    while state["transitions"] < cfg.transitions:
+    while not finished():
         with watch("wait"):
             found, ahead = ahead or collector.result(), None
         data = found.steps.clone(recurse=False)
@@ -123,15 +131,12 @@ def pretrain(cfg: DictConfig) -> int:
         logger.log(state["transitions"], {"updates": state["updates"], **metrics, **counts})
         bar.update(state["transitions"] - bar.n)
         bar.set_postfix(success=f"{result.success:.0%}" if result else "-", loss=f"{metrics.get('loss', 0):.2f}")
-        done = state["streak"] >= cfg.target_streak and state["transitions"] >= cfg.min_transitions
-        if stop.asked or done or state["round"] % cfg.save_every == 0:
+        if stop.asked or finished() or state["round"] % cfg.save_every == 0:
             with watch("save"):
                 save()
         if stop.asked:
             collector.close()
             raise Stopped(f"saved after {state['transitions']} transitions. Go on: {go_on}")
-        if done:
-            break
     save()
     collector.close()
     bar.close()

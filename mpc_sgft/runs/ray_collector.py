@@ -36,7 +36,8 @@ class Ray(AbstractCollector):
         address: `host:port` or `auto` of a cluster to join; None starts one here and stops it at the end.
 
     Raises:
-        UserError: If Ray is not installed, nobody answers at the address, or a worker has other versions.
+        UserError: If Ray is not installed, nobody answers at the address, the cluster has too few CPUs, or a worker has
+            other versions.
     """
 
     def __init__(self, cfg: DictConfig, sizes: dict, workers: int, address: str | None = None) -> None:
@@ -63,6 +64,13 @@ class Ray(AbstractCollector):
             says = f"collector.address={address}: Ray could not join that cluster. {text} {TOKEN_SAYS}"
             raise UserError(says) from error
         self._ray, self._found = ray, None
+        cores = int(ray.cluster_resources().get("CPU", 0))
+        if workers > cores:  # the last ones would be waited for without end
+            ray.shutdown()
+            raise UserError(
+                f"collector.workers={workers}: the cluster at {address} has {cores} CPUs, and each worker takes one. "
+                f"Give collector.workers={cores} or fewer, or let more machines join it."
+            )
         actor = ray.remote(num_cpus=1, max_restarts=-1, max_task_retries=-1)(_Worker)
         blobs = [pickle.dumps((cfg, sizes, part, workers)) for part in range(workers)]
         self._workers = [actor.remote(blob) for blob in blobs]

@@ -96,6 +96,16 @@ def test_pretraining_resumes_with_the_same_numbers(pretrained, tmp_path):
     assert model.value_range == pytest.approx(float(rows(half)[-1]["scale"])) and model.value_range > 1.1
 
 
+def test_a_run_that_held_its_target_goes_on_only_when_told_to(tmp_path):
+    easy = "target_success=0.0", "target_streak=1", "min_transitions=320", "eval_every=1", "collector=inline"
+    given, numbers = ["pretrain", "--resume", str(tmp_path / "r")], lambda: [r["updates"] for r in rows(tmp_path / "r")]
+    assert here("pretrain", f"run_dir={tmp_path / 'r'}", "transitions=1920", *easy).returncode == 0
+    before = numbers()
+    assert "More training: min_transitions=N" in here(*given, "transitions=3840").stdout and numbers() == before
+    assert here(*given, "min_transitions=960").returncode == 0
+    assert numbers()[: len(before)] == before and len(numbers()) > len(before)
+
+
 def test_widening_randomisation_resumes_with_the_same_numbers(tmp_path):
     words = "curriculum=doraemon", "curriculum.episodes=6", "curriculum.success=0.01", "collector=inline"
     whole, half = tmp_path / "whole", tmp_path / "half"

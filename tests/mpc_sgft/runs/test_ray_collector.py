@@ -32,7 +32,14 @@ CFG = compose.compose("pretrain", ["task=pendulum", "+experiment=debug", "num_en
 
 
 def workers_of(parent: psutil.Process) -> list[psutil.Process]:
-    return [p for p in parent.children(recursive=True) if p.name().startswith("ray::_Worker")]
+    return [p for p in parent.children(recursive=True) if _name(p).startswith("ray::_Worker")]
+
+
+def _name(process: psutil.Process) -> str:
+    try:
+        return process.name()
+    except psutil.NoSuchProcess:  # it ended since it was listed
+        return ""
 
 
 @pytest.fixture(scope="module")
@@ -104,6 +111,11 @@ def test_a_cluster_that_is_there_is_joined_and_left_as_it_was(tmp_path: Path) ->
                 _, error = run.communicate(timeout=120)
             assert seen and run.returncode == 0, error
             assert head.poll() is None and not workers_of(psutil.Process(head.pid))
+            words[words.index("collector=ray")] = "collector.workers=3"  # more than it has CPUs
+            line = [sys.executable, "-m", "mpc_sgft.pretrain", "--quiet", "collector=ray", "num_envs=8", *words]
+            line = [word.replace(str(tmp_path / "run"), str(tmp_path / "more")) for word in line]
+            done = subprocess.run(line, stderr=subprocess.PIPE, text=True, env=own, timeout=120, check=False)
+            assert done.returncode == 2 and f"the cluster at {address} has 2 CPUs" in done.stderr, done.stderr
         finally:
             head.stdin.close()
         assert head.wait(timeout=60) == 0

@@ -1,0 +1,24 @@
+"""How small the counts of the commands may be, so that a slip is said at once and not after an hour."""
+
+from omegaconf import DictConfig
+
+from mpc_sgft.command.errors import UserError
+
+FROM_ZERO = ("seed", "eval_seed", "min_transitions", "random_transitions", "imagined_steps", "hold_value", "warmup")
+FROM_ONE = (
+    *("rollouts", "episodes", "eval_every", "eval_episodes", "final_episodes", "save_every"),
+    *("num_envs", "torch_threads", "transitions", "lr_halves_every", "target_streak"),
+)
+
+
+def check_counts(cfg: DictConfig) -> None:
+    """Refuse what is no whole number, or too small.
+
+    Raises:
+        UserError: Which one, and what it may be.
+    """
+    for least, keys in enumerate((FROM_ZERO, FROM_ONE)):
+        for key in (key for key in keys if key in cfg):
+            value = cfg[key]
+            if not isinstance(value, int) or isinstance(value, bool) or value < least:
+                raise UserError(f"{key}={value}: a whole number from {least} on is needed.")
