@@ -24,7 +24,11 @@ def evaluate(cfg: DictConfig) -> int:
     env = build.make_env(cfg, min(cfg.episodes, CHUNK), randomised=True)
     if cfg.episodes % env.batch_size[0]:
         raise UserError(f"episodes={cfg.episodes}: more than {CHUNK} must be a multiple of {CHUNK}.")
-    act = _policy(cfg, env)
+    act, film = _policy(cfg, env), None
+    if cfg.video:  # what is missing shows before hours of episodes
+        from mpc_sgft.views.video import Film
+
+        film = Film(build.make_env(cfg, 1))
     folder = run_folder.start(cfg)
     build.prepare_process(cfg)
     rounds, first = cfg.episodes // env.batch_size[0], EVAL_SEED + APART * cfg.seed
@@ -44,10 +48,8 @@ def evaluate(cfg: DictConfig) -> int:
         "return": result.episode_return,
         "unstable_episodes": env.backend.counters["unstable"],
     }
-    if cfg.video:
-        from mpc_sgft.views.video import write_video
-
-        summary["video"] = str(write_video(folder / "episode.mp4", build.make_env(cfg, 1), act, first))
+    if film is not None:
+        summary["video"] = str(film.write(folder / "episode.mp4", act, first))
     run_folder.write_summary(folder, summary)
     print(json.dumps(summary))
     return 0

@@ -31,3 +31,4 @@ def test_no_way_to_draw_is_a_clear_line(tmp_path):
     )
     assert done.returncode == 2, done.stderr
     assert "MUJOCO_GL=egl" in done.stderr and "Traceback" not in done.stderr
+    assert not (tmp_path / "run").exists()  # nothing was done yet
