@@ -149,10 +149,15 @@ def as_rollout(name: str, episode: Episode, task: AbstractTask) -> Rollout:
         if not np.isfinite(values[whole]).all():
             raise UserError(f"episode {name}: {key} is not a number in some joint samples.")
     observation = np.concatenate([data["observation"][:1], data["next_observation"]])
+    action = np.asarray(data["action_sent"][:steps], float).reshape(steps, -1)
+    observation = np.asarray(observation[: steps + 1, : len(task.observation_names)], float)
+    for key, values in (("action_sent", action), ("observation", observation)):
+        if len(rows := np.flatnonzero(~np.isfinite(values).all(1))):
+            raise UserError(f"episode {name}: {key} is not a number in step {rows[0]}. Leave its file out.")
     return Rollout(
         name=name,
-        action=np.asarray(data["action_sent"][:steps], float).reshape(steps, -1),
-        observation=np.asarray(observation[: steps + 1, : len(task.observation_names)], float),
+        action=action,
+        observation=observation,
         time=joints["time"][whole],
         success=bool((episode.outcome or {}).get("success", False)),
         **{key: values[whole] for key, values in arrays.items()},

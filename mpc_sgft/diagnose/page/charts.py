@@ -98,14 +98,14 @@ class Chart:
         """The whole drawing."""
         right, bottom = self.right, self.height - BOTTOM
         grid, names = [], []
-        for v in ticks(*self.x, log=self.log_x):
+        for v, name in named(ticks(*self.x, log=self.log_x), 4):
             at = float(self.px(v))
             grid.append(f"M{at:.1f} {TOP}V{bottom}")
-            names.append(text(at, bottom + 15, f"{v:.4g}", "middle", "x"))
-        for v in ticks(*self.y) if y_ticks else ():
+            names.append(text(at, bottom + 15, name, "middle", "x"))
+        for v, name in named(ticks(*self.y), 3) if y_ticks else ():
             at = float(self.py(v))
             grid.append(f"M{self.left} {at:.1f}H{right}")
-            names.append(text(self.left - 6, at + 4, f"{v:.3g}", "end"))
+            names.append(text(self.left - 6, at + 4, name, "end"))
         middle = (TOP + bottom) / 2
         turned = f'transform="rotate(-90 14 {middle:.0f})"'
         zoom = f' data-zoom="{self.x[0]} {self.x[1]} {self.left} {right}"' if self.zoom else ""
@@ -136,6 +136,15 @@ def ticks(low: float, high: float, log: bool = False) -> list[float]:
     step = size * min((1, 2, 5, 10), key=lambda k: abs(k * size - raw))
     first = np.ceil(low / step - 1e-9)
     return [float(k * step) + 0.0 for k in np.arange(first, np.floor(high / step + 1e-9) + 1)]
+
+
+def named(values: Sequence[float], digits: int) -> list[tuple[float, str]]:
+    """Numbers with their names, of so many digits, or as many as tell them apart."""
+    while True:
+        names = [f"{v:.{digits}g}" for v in values]
+        if len(set(names)) == len(set(values)) or digits >= 17:
+            return list(zip(values, names, strict=True))
+        digits += 1
 
 
 def span(*values: Array, trim: float = 0.0) -> tuple[float, float]:

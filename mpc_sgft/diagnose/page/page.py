@@ -125,24 +125,25 @@ def _laws(laws: Laws) -> str:
 
 
 def _signals(d: Mapping[str, Any], lines: Lines) -> str:
-    names, t = lines.names[:SIGNALS], lines.time
-    units = {s["signal"]: s["unit"] for s in d["signals"]}
+    worst, t = d["signals"][:SIGNALS], lines.time
     W, n = t.shape
-    pick = list(thinned(n, max(2, POINTS // (len(SERIES) * max(1, len(names)) * W))))
+    pick = list(thinned(n, max(2, POINTS // (len(SERIES) * len(worst) * W))))
     gap = np.full((W, 1), np.nan)  # windows start anew at the measured state
     x = np.concatenate([t[:, pick], t[:, -1:]], 1).ravel()
     figures = []
-    for i, name in enumerate(names):
-        values = [getattr(lines, kind)[..., i][:, pick] for kind in SERIES]
-        chart = Chart(
-            900, 230, span(t), span(values[0], values[2]), ("time [s]", f"{name} [{units.get(name, '')}]"), zoom=True
-        )
+    for name, unit in ((s["signal"], s["unit"]) for s in worst):
+        values = [getattr(lines, kind)[..., lines.names.index(name)][:, pick] for kind in SERIES]
+        chart = Chart(900, 230, span(t), span(values[0], values[2]), ("time [s]", f"{name} [{unit}]"), zoom=True)
         for kind, y in zip(SERIES, values, strict=True):
-            chart.line(x, np.concatenate([y, gap], 1).ravel(), kind)
+            if n > 1:
+                chart.line(x, np.concatenate([y, gap], 1).ravel(), kind)
+            else:
+                chart.dots(t.ravel(), y.ravel(), kind)
         figures.append(f"<figure>{chart.svg(f'{name}: measured, nominal and repaired')}</figure>")
+    which = f" The {SIGNALS} signals with the largest error." if len(lines.names) > SIGNALS else ""
     return (
-        "<h2>Measured, nominal, repaired</h2><p>Short windows, each from its measured start. Drag across a chart to "
-        f"look closer, double-click for all of it.</p><p>{_keys(SERIES)}</p>{''.join(figures)}"
+        f"<h2>Measured, nominal, repaired</h2><p>Short windows, each from its measured start.{which} Drag across a "
+        f"chart to look closer, double-click for all of it.</p><p>{_keys(SERIES)}</p>{''.join(figures)}"
         "<p class='soft'>The same in the viewer, with all signals in step: <a href='report.rrd'>report.rrd</a>, or "
         "<code id='view'>rerun report.rrd</code> <button data-copy='view'>copy</button></p>"
     )

@@ -20,7 +20,7 @@ from mpc_sgft.diagnose.deployed import diagnose_run, unit_at, unit_of_signal
 from mpc_sgft.diagnose.deployments.chain import Chain
 from mpc_sgft.diagnose.deployments.command_link import ServoCommands, measured_drive, saturated
 from mpc_sgft.diagnose.deployments.next_recording import repeated
-from mpc_sgft.diagnose.deployments.recordings import joint_columns, read_deployment
+from mpc_sgft.diagnose.deployments.recordings import as_rollout, joint_columns, read_deployment
 from mpc_sgft.storage.episode_file import read_episode
 
 SLIDE, HINGE = mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE
@@ -222,6 +222,15 @@ def test_a_cut_episode_is_read_as_far_as_it_is_whole(deployed) -> None:
     deployment = read_deployment(run)
     assert [len(e.action) for e in deployment.episodes][0] == 40 and 10 < len(deployment.episodes[1].action) < 40
     assert "0002.mcap: it ends in the middle of a record" in deployment.notes[0]
+
+
+def test_an_observation_that_is_no_number_is_named(deployed) -> None:
+    run = deployed({}, episodes=4)
+    task, path = read_deployment(run).task, next((run / "episodes").glob("*.mcap"))
+    episode = read_episode(path)
+    episode.transitions["next_observation"][11, 2] = np.nan
+    with pytest.raises(UserError, match=f"episode {path.stem}: observation is not a number in step 12"):
+        as_rollout(path.stem, episode, task)
 
 
 def test_folders_that_are_no_deployment(tmp_path: Path, deployed) -> None:

@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 
 from mpc_sgft.diagnose import diagnose
-from mpc_sgft.diagnose.page.charts import Chart, ticks
+from mpc_sgft.diagnose.page.charts import Chart, named, ticks
+from mpc_sgft.diagnose.page.page import Lines, _signals
 from mpc_sgft.diagnose.simulation.plant import load_plant
 from mpc_sgft.diagnose.verdict.repair import diff, nominal_spec
 
@@ -116,3 +117,21 @@ def test_places_on_an_axis() -> None:
     broken = Chart(200, 100, (0, 3), (0, 1), ("x", "y"))
     broken.line(np.arange(4.0), np.array([0.0, np.nan, 1.0, 0.5]), "measured")
     assert broken.inside[0].count("M") == 2
+
+
+def test_names_of_ticks_tell_them_apart() -> None:
+    assert named([0.0, 0.5, 1.0], 3) == [(0.0, "0"), (0.5, "0.5"), (1.0, "1")]
+    assert [name for _, name in named([100.001, 100.002, 100.0025], 3)] == ["100.001", "100.002", "100.0025"]
+
+
+def test_the_worst_signals_are_drawn_and_single_samples_show() -> None:
+    names = [f"qpos/{letter}" for letter in "abcdefgh"]
+    worst = [{"signal": name, "unit": "rad"} for name in reversed(names)]
+    found = {}
+    for n in (1, 5):
+        time, values = np.arange(3.0 * n).reshape(3, n), np.ones((3, n, len(names)))
+        found[n] = _signals({"signals": worst}, Lines(names, time, values, values + 1, values))
+        drawn = re.findall(r"<title>(\S+): measured", found[n])
+        assert drawn == names[:1:-1] and "6 signals with the largest error" in found[n]
+    assert 'class="line' in found[5] and 'class="dots' not in found[5]
+    assert 'class="dots measured' in found[1] and 'class="line' not in found[1]
