@@ -216,6 +216,8 @@ def assemble(
     nominal, repaired = replayer.simulate([Change(), change_of(held.fit.terms, held.fit.values)])
     measured = replayer.windows.measured
     signals = _signals(setup, nominal, repaired, measured, rng)
+    if len(setup.held) == 1:
+        notes = [*notes, "one window only is held out: intervals of what is held out have no width; record longer"]
     shown = verdict.kind in ("effect", "not_identifiable")
     ties = [
         {"effects": e.names, "probability": verdict.probability[e.key], "held_out_error": e.error, "reason": reason}

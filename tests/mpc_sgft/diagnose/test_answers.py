@@ -86,3 +86,12 @@ def test_what_no_name_covers_is_unknown(waves: float, slide: Path, record: Recor
     assert report["verdict"] == "unknown" and report["effects"] == []
     assert "flexible residual model" in report["reason"]
     assert report["residual_model_error"] < report["candidates"][0]["held_out_error"] - 1
+
+
+def test_one_window_held_out_is_said(slide: Path, record: Record) -> None:
+    data = [record("long", seconds=4.0, viscous=6.0), record("short", seconds=0.8, viscous=6.0, seed=1)]
+    told = {"effects": ["viscous_friction"], "window": 0.4}
+    short, long = (diagnose(slide, data, held_out=[name], **told).as_dict() for name in ("short", "long"))
+    assert short["held_out"]["windows"] == 1 and short["held_out"]["low"] == short["held_out"]["high"]
+    said = [any("one window only is held out" in note for note in r["notes"]) for r in (short, long)]
+    assert said == [True, False] and long["held_out"]["low"] < long["held_out"]["high"]
