@@ -108,7 +108,7 @@ def test_groups_and_effects_are_the_files_on_disk() -> None:
         (["method=sgtf"], ["unknown method 'sgtf'", "sgft", "zero_shot"]),
         (["device=gpu"], ["unknown device 'gpu'", "cuda"]),
         (["seed=one"], ["a whole number is needed"]),
-        (["planner.num_candidates=1e2"], ["a whole number is needed, as in planner.num_candidates="]),
+        (["planner.num_candidates=1.5"], ["a whole number is needed, as in planner.num_candidates="]),
         (["planner.temperature=hot"], ["a number is needed"]),
         (["eval_every=0"], ["eval_every=0: a whole number from 1 on"]),
         (["warmup=-1"], ["warmup=-1: a whole number from 0 on"]),
@@ -147,6 +147,8 @@ def test_what_does_not_exist_is_one_line_and_exit_2(args: list[str], parts: list
         ("planner.num_candidates=6", "num_elites"),
         ("final_episodes=0", "final_episodes=0: a whole number from 1 on"),
         ("detours.share=2", "detours.share=2: a share"),
+        ("detours.rest=null", "detours.rest=None: a share"),
+        ("detours.steps=null", "detours.steps=(): from and to"),
         ("detours.steps=[5,2]", "detours.steps=[5, 2]: from and to"),
     ],
 )
@@ -173,6 +175,7 @@ def test_a_real_process_ends_with_2_and_no_traceback(name: str, command) -> None
         (["--seed", "3"], "3 none 4"),
         (["horizon=8"], "0 none 8"),
         (["planner.horizon=2", "planner=cem"], "0 none 2"),
+        (["planner.horizon=2e0"], "0 none 2"),
         (["+gap.effects.actuator_gain.gain=0.6"], "0 none+actuator_gain.gain=0.6 4"),
         (["gap.effects.actuator_gain.gain=0.6", "gap=none"], "0 none+actuator_gain.gain=0.6 4"),
     ],
@@ -261,6 +264,10 @@ def test_resume_takes_the_saved_config_and_its_folder(loops: Path, capsys) -> No
     assert cli.run(probe("folder"), ["--resume", "first", "horizon=3"]) == 0
     assert cli.run(probe("show"), ["--resume", "first"]) == 0  # what it was told holds from then on
     assert capsys.readouterr().out.split("\n")[1] == "7 none 3"
+    assert cli.run(probe("folder"), ["run_dir=whole", "planner.temperature=1"]) == 0  # may have a fraction all the same
+    assert cli.run(probe("show"), ["--resume", "whole", "planner.temperature=0.5"]) == 0
+    assert cli.run(probe("show"), ["--resume", "whole", "rollouts=${nowhere}"]) == 2
+    assert "cannot be resolved" in capsys.readouterr().err
 
 
 def test_a_gap_may_be_a_file(loops: Path, capsys) -> None:

@@ -44,6 +44,7 @@ KINDS: tuple[tuple[type, tuple[type, ...], str], ...] = (  # of a default, and w
     (list, (list,), "a list"),
     (ListConfig, (list,), "a list"),
 )
+WHOLE = re.compile(r"=\d+(\.\d+)?[eE]\+?\d{1,2}")
 FORM = re.compile(r"(?P<sign>\+\+|\+|~)?(?P<key>[A-Za-z_][\w./@-]*)(?P<rest>=.*)?", re.DOTALL)
 
 
@@ -66,7 +67,8 @@ def spread(given: Sequence[str]) -> list[str]:
 def normalise(override: str) -> str:
     """Spell an override the way Hydra wants it.
 
-    `horizon=8` sets the planner's horizon; effects of the gap and the experiment may be given with `+` or without.
+    `horizon=8` sets the planner's horizon; effects of the gap and the experiment may be given with `+` or without; 1e6
+    is 1000000.
 
     Raises:
         UserError: If it is not of the form key=value, or has another name now.
@@ -75,6 +77,8 @@ def normalise(override: str) -> str:
     if form is None or (form["rest"] is None and form["sign"] != "~"):
         raise UserError(f"cannot read {override!r}. Write overrides as key=value, e.g. seed=1; --help lists the names.")
     sign, key, rest = form["sign"] or "", form["key"], form["rest"] or ""
+    if WHOLE.fullmatch(rest) and float(rest[1:]).is_integer():  # 1e6 counts, too
+        rest = f"={int(float(rest[1:]))}"
     for old, new in RENAMED.items():
         if key.startswith(old):
             raise UserError(f"{key} is called {new}{key.removeprefix(old)} now: {new}{key.removeprefix(old)}{rest}")
@@ -186,10 +190,7 @@ def complete(cfg: DictConfig, name: str, chosen: Mapping[str, str | None], given
         for key in ("checkpoint", "resume"):
             if cfg[key] is not None and Path(str(cfg[key])).exists():
                 cfg[key] = str(Path(str(cfg[key])).resolve())
-    try:
-        OmegaConf.resolve(cfg)
-    except OmegaConfBaseException as err:
-        raise UserError(f"the config cannot be resolved: {first_line(err)}") from err
+    _resolve(cfg)
     check_counts(cfg)
     OmegaConf.set_struct(cfg, True)
     return cfg
@@ -216,7 +217,8 @@ def resume(name: str, folder: str, overrides: Sequence[str], given: Sequence[str
         raise UserError(f"cannot resume {folder} with {name}: {wrote or 'another program'} wrote it.")
     differs = [f"{t} has moved since" for t in _targets(cfg) if find_spec(t.rpartition(".")[0]) is None]
     taken_out = tuple(text[1:].partition("=")[0] for text in cfg.overrides if text.startswith("~"))
-    lacking = (key for key in _lacking(_of_today(name, cfg), cfg) if not key.startswith(taken_out))
+    today = _of_today(name, cfg)
+    lacking = (key for key in _lacking(today, cfg) if not key.startswith(taken_out))
     differs += [f"it had no {key}" for key in lacking]
     if OmegaConf.select(cfg, "planner.temperature", default=0) > 1:
         differs += ["its planner.temperature was in reward units"]
@@ -236,8 +238,9 @@ def resume(name: str, folder: str, overrides: Sequence[str], given: Sequence[str
             raise UserError(f"{key!r} cannot change in a resumed run. Start a new one, or leave it out.")
         if not key.startswith(OPEN):
             _check_key(cfg, key)
-        _check_kind(OmegaConf.select(cfg, key), override)
+        _check_kind(OmegaConf.select(today, key, default=OmegaConf.select(cfg, key)), override)
         OmegaConf.update(cfg, key, override.value(), force_add=key.startswith(OPEN))
+    _resolve(cfg)
     check_counts(cfg)
     cfg.resume = cfg.run_dir = str(path)
     cfg.overrides = [*cfg.overrides, *given]
@@ -269,6 +272,13 @@ def _compose(name: str, overrides: Sequence[str]) -> DictConfig:
         raise UserError(first_line(err)) from err
     finally:
         GlobalHydra.instance().hydra = sweep
+
+
+def _resolve(cfg: DictConfig) -> None:
+    try:
+        OmegaConf.resolve(cfg)
+    except OmegaConfBaseException as err:
+        raise UserError(f"the config cannot be resolved: {first_line(err)}") from err
 
 
 def _contents(group: str, path: str) -> list[tuple[str, Any]]:
@@ -357,6 +367,12 @@ def _check_key(cfg: Any, key: str) -> None:
 
 def _check_kind(default: Any, override: Override) -> None:
     value = override.value()
+    if (
+        isinstance(default, int)
+        and not isinstance(default, bool)
+        and override.key_or_group.rpartition(".")[2].isdigit()
+    ):
+        default = float(default)  # of a list, whose other numbers may have fractions
     for kind, allowed, words in KINDS:
         if isinstance(default, kind):
             right = isinstance(value, allowed) and (kind is bool or not isinstance(value, bool))

@@ -4,9 +4,12 @@ from omegaconf import DictConfig
 
 from mpc_sgft.command.errors import UserError
 
-FROM_ZERO = ("seed", "eval_seed", "min_transitions", "random_transitions", "imagined_steps", "hold_value", "warmup")
+FROM_ZERO = (
+    *("seed", "eval_seed", "rollouts", "warmup"),
+    *("min_transitions", "random_transitions", "imagined_steps", "hold_value"),
+)
 FROM_ONE = (
-    *("rollouts", "episodes", "eval_every", "eval_episodes", "final_episodes", "save_every"),
+    *("episodes", "eval_every", "eval_episodes", "final_episodes", "save_every"),
     *("num_envs", "torch_threads", "transitions", "lr_halves_every", "target_streak"),
 )
 
@@ -20,5 +23,7 @@ def check_counts(cfg: DictConfig) -> None:
     for least, keys in enumerate((FROM_ZERO, FROM_ONE)):
         for key in (key for key in keys if key in cfg):
             value = cfg[key]
+            if isinstance(value, float) and value.is_integer():  # 1e6
+                value = cfg[key] = int(value)
             if not isinstance(value, int) or isinstance(value, bool) or value < least:
                 raise UserError(f"{key}={value}: a whole number from {least} on is needed.")

@@ -30,7 +30,16 @@ from mpc_sgft.diagnose.fitting.prepare import Setup, leave_out_blocks, split
 from mpc_sgft.diagnose.fitting.screening import Effort
 from mpc_sgft.diagnose.fitting.search import search
 from mpc_sgft.diagnose.report import Report
-from mpc_sgft.diagnose.rows import Shown, candidate_rows, effect_rows, reduction, trace_rows, unit_of, waterfall
+from mpc_sgft.diagnose.rows import (
+    Shown,
+    candidate_rows,
+    effect_rows,
+    few_windows,
+    reduction,
+    trace_rows,
+    unit_of,
+    waterfall,
+)
 from mpc_sgft.diagnose.verdict import repair
 from mpc_sgft.diagnose.verdict.naming import choose as choose_set
 from mpc_sgft.diagnose.verdict.naming import settled
@@ -118,6 +127,7 @@ def diagnose_run(
     notes = list(deployment.notes)
     if len(deployment.episodes) == 1:
         notes.append("one episode only: its end is held out, so that both sides come from the same run")
+    notes += few_windows(setup.held)
     held = verdict.there if traces else verdict.best
     report = assemble(setup, hypotheses, verdict, held, notes, rng, residual_model and residual_model.error)
     if out is not None:

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mpc_sgft.diagnose.candidates.library import Term, effect_parameters, sums_of
-from mpc_sgft.diagnose.data.measured import Array
+from mpc_sgft.diagnose.data.measured import Array, Index
 from mpc_sgft.diagnose.fitting import judge
 from mpc_sgft.diagnose.fitting.hypothesis import Hypothesis, without_effect
 from mpc_sgft.diagnose.fitting.prepare import Setup
@@ -166,6 +166,12 @@ def candidate_rows(
 def fallen(before: Array, after: Array) -> Array:
     """By which share roots of mean squares fell; 0 where there was nothing before and after."""
     return np.where((before == 0) & (after == 0), 0.0, 1 - np.sqrt(after / np.maximum(before, 1e-300)))
+
+
+def few_windows(held: Sequence[int] | Index) -> list[str]:
+    """A note if the windows that are held out are too few for intervals."""
+    says = "one window only is held out: intervals of what is held out have no width; record longer"
+    return [says] if len(held) == 1 else []
 
 
 def reduction(signal: str, unit: str, before: Array, after: Array, rng: np.random.Generator) -> dict[str, Any]:

@@ -27,7 +27,16 @@ from mpc_sgft.diagnose.fitting.screening import key_of
 from mpc_sgft.diagnose.fitting.search import nearest, refit, search
 from mpc_sgft.diagnose.page.laws import missing_forces
 from mpc_sgft.diagnose.report import Report
-from mpc_sgft.diagnose.rows import Shown, candidate_rows, effect_rows, reduction, trace_rows, unit_of, waterfall
+from mpc_sgft.diagnose.rows import (
+    Shown,
+    candidate_rows,
+    effect_rows,
+    few_windows,
+    reduction,
+    trace_rows,
+    unit_of,
+    waterfall,
+)
 from mpc_sgft.diagnose.simulation.plant import SHARP, Change, Plant, driven, joint_of
 from mpc_sgft.diagnose.simulation.replay import Replayer
 from mpc_sgft.diagnose.verdict import repair
@@ -137,6 +146,7 @@ def run(
     notes = [*plant.notes, *(n for e in recorded for n in e.notes)]
     if len(recorded) == 1:
         notes.append("one episode only: its end is held out, so that both sides come from the same run")
+    notes += few_windows(setup.held)
     held = verdict.there if traces else verdict.best
     left = residual_model and residual_model.error
     fitted = setup.problem.replayer
@@ -216,8 +226,6 @@ def assemble(
     nominal, repaired = replayer.simulate([Change(), change_of(held.fit.terms, held.fit.values)])
     measured = replayer.windows.measured
     signals = _signals(setup, nominal, repaired, measured, rng)
-    if len(setup.held) == 1:
-        notes = [*notes, "one window only is held out: intervals of what is held out have no width; record longer"]
     shown = verdict.kind in ("effect", "not_identifiable")
     ties = [
         {"effects": e.names, "probability": verdict.probability[e.key], "held_out_error": e.error, "reason": reason}

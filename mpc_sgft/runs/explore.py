@@ -158,9 +158,10 @@ def explorer(model: WorldModel, cfg: DictConfig, num_envs: int, seed: int) -> Ac
 def check_exploration(cfg: DictConfig) -> None:
     """Raise UserError unless detours, and what a task is asked in training alone, can be: no worker has begun yet."""
     for name in ("share", "rate", "rest"):
-        if not 0 <= cfg.detours[name] <= 1:
-            raise UserError(f"detours.{name}={cfg.detours[name]}: a share, between 0 and 1.")
-    steps = cfg.detours.steps
+        value = cfg.detours[name]
+        if value is None or not 0 <= value <= 1:
+            raise UserError(f"detours.{name}={value}: a share, between 0 and 1.")
+    steps = cfg.detours.steps or ()
     if len(steps) != 2 or not all(isinstance(n, int) for n in steps) or not 0 < steps[0] < steps[1]:
         raise UserError(f"detours.steps={steps}: from and to (without), two whole numbers, 0 < from < to.")
     build.make_env(cfg, 1, randomised=True, learning=True).backend.close()

@@ -74,8 +74,8 @@ def pretrain(cfg: DictConfig) -> int:
         agent.averaged.value_range = float(agent.scale.value)
         meta = checkpoint.describe(cfg, agent.averaged, extra={"transitions": state["transitions"]})
         checkpoint.save(folder / "checkpoint" / "model.safetensors", agent.averaged, meta)
-        coming = ahead or (collector.result() if state["transitions"] < cfg.transitions else None)
-        parts = {"loop": state, "spent": watch.spent, "order": tuple(order), "ahead": coming and coming.state_dict()}
+        ahead = collector.result().state_dict() if state["transitions"] < cfg.transitions else None
+        parts = {"loop": state, "spent": watch.spent, "order": tuple(order), "ahead": ahead}
         parts["curriculum"] = None if curriculum is None else curriculum.state_dict()
         checkpoint.save_state(saved, {**parts, "agent": agent.state_dict(), "buffer": buffer.state_dict()})
 
@@ -93,7 +93,9 @@ def pretrain(cfg: DictConfig) -> int:
     if cfg.resume is not None:
         order, ahead = Round(*stored["order"]), stored["ahead"] and Collected.of(stored["ahead"])
     if finished():
-        print(f"{folder} is finished: only its final evaluation is made. More training: min_transitions=N")
+        print(
+            f"{folder} is finished: only its final evaluation is made. More training: transitions=N min_transitions=N"
+        )
     elif ahead is None:
         with watch("wait"):
             collector.start(order)
@@ -137,7 +139,6 @@ def pretrain(cfg: DictConfig) -> int:
         if stop.asked:
             collector.close()
             raise Stopped(f"saved after {state['transitions']} transitions. Go on: {go_on}")
-    save()
     collector.close()
     bar.close()
     stop.restore()
@@ -213,6 +214,8 @@ def start_agent(cfg: DictConfig, env: ControlEnv) -> Agent:
         )
     agent, meta = build.load_agent(cfg)
     build.check_fits(agent.model, env)
+    if cfg.imagined_steps:  # then it is only saved; where the policy climbs the critics it scales its loss
+        agent.scale.value.fill_(agent.model.value_range)
     changed = [part for part in ("command_map", "residual") if meta.get(part)]
     if changed:
         raise UserError(

@@ -125,22 +125,24 @@ def _laws(laws: Laws) -> str:
 
 
 def _signals(d: Mapping[str, Any], lines: Lines) -> str:
-    worst, t = d["signals"][:SIGNALS], lines.time
+    rows, t = {s["signal"]: (i, s["unit"]) for i, s in enumerate(d["signals"])}, lines.time  # the worst first
+    names = sorted(lines.names, key=lambda name: rows.get(name, (len(rows), ""))[0])[:SIGNALS]
     W, n = t.shape
-    pick = list(thinned(n, max(2, POINTS // (len(SERIES) * len(worst) * W))))
+    pick = list(thinned(n, max(2, POINTS // (len(SERIES) * max(1, len(names)) * W))))
     gap = np.full((W, 1), np.nan)  # windows start anew at the measured state
     x = np.concatenate([t[:, pick], t[:, -1:]], 1).ravel()
     figures = []
-    for name, unit in ((s["signal"], s["unit"]) for s in worst):
+    for name in names:
         values = [getattr(lines, kind)[..., lines.names.index(name)][:, pick] for kind in SERIES]
-        chart = Chart(900, 230, span(t), span(values[0], values[2]), ("time [s]", f"{name} [{unit}]"), zoom=True)
+        label = f"{name} [{rows.get(name, (0, ''))[1]}]"
+        chart = Chart(900, 230, span(t), span(values[0], values[2]), ("time [s]", label), zoom=True)
         for kind, y in zip(SERIES, values, strict=True):
             if n > 1:
                 chart.line(x, np.concatenate([y, gap], 1).ravel(), kind)
             else:
                 chart.dots(t.ravel(), y.ravel(), kind)
         figures.append(f"<figure>{chart.svg(f'{name}: measured, nominal and repaired')}</figure>")
-    which = f" The {SIGNALS} signals with the largest error." if len(lines.names) > SIGNALS else ""
+    which = f" The {SIGNALS} with the largest error in units of their noise." if len(lines.names) > SIGNALS else ""
     return (
         f"<h2>Measured, nominal, repaired</h2><p>Short windows, each from its measured start.{which} Drag across a "
         f"chart to look closer, double-click for all of it.</p><p>{_keys(SERIES)}</p>{''.join(figures)}"

@@ -73,9 +73,11 @@ def test_ice_is_named_by_how_far_the_puck_slides(deployed) -> None:
     assert not any(law.where.startswith("drive") for law in found.laws.laws), "commands reach the servos as they are"
 
 
-def test_one_joint_is_told_from_all_by_its_force(deployed) -> None:
-    run = deployed({"coulomb_friction": {"torque": 2.0, "at": ["joint4"]}})
-    named = diagnose_run(run, effects=["coulomb_friction", "actuator_gain"], max_effects=2).as_dict()
+def test_one_joint_is_told_from_all_by_its_force(deployed, tmp_path: Path) -> None:
+    run, out = deployed({"coulomb_friction": {"torque": 2.0, "at": ["joint4"]}}), tmp_path / "out"
+    named = diagnose_run(run, effects=["coulomb_friction", "actuator_gain"], max_effects=2, out=out).as_dict()
+    assert named["signals"][0]["signal"] == "qpos/joint4" and (out / "report.rrd").exists()
+    assert "qpos/joint4: measured" not in (out / "report.html").read_text()  # its lines are forces and observations
     (effect,) = named["effects"]
     assert (named["verdict"], effect["name"], effect["at"]) == ("effect", "coulomb_friction", ["joint4"])
     assert effect["parameters"]["torque"]["unit"] == "N m"

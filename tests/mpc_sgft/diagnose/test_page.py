@@ -126,12 +126,12 @@ def test_names_of_ticks_tell_them_apart() -> None:
 
 def test_the_worst_signals_are_drawn_and_single_samples_show() -> None:
     names = [f"qpos/{letter}" for letter in "abcdefgh"]
-    worst = [{"signal": name, "unit": "rad"} for name in reversed(names)]
+    worst = [{"signal": name, "unit": "rad"} for name in ("elsewhere", *reversed(names))]  # what no line shows, too
     found = {}
     for n in (1, 5):
         time, values = np.arange(3.0 * n).reshape(3, n), np.ones((3, n, len(names)))
         found[n] = _signals({"signals": worst}, Lines(names, time, values, values + 1, values))
         drawn = re.findall(r"<title>(\S+): measured", found[n])
-        assert drawn == names[:1:-1] and "6 signals with the largest error" in found[n]
+        assert drawn == names[:1:-1] and "The 6 with the largest error" in found[n]
     assert 'class="line' in found[5] and 'class="dots' not in found[5]
     assert 'class="dots measured' in found[1] and 'class="line' not in found[1]
