@@ -1,9 +1,8 @@
-"""The front of the commands, as a user meets it: help, names, exit codes, folders."""
+"""The front of the commands, as a user meets it: help, names, exit codes, overrides."""
 
 from __future__ import annotations
 
 import gc
-import json
 import re
 import subprocess
 import sys
@@ -16,41 +15,10 @@ from omegaconf import OmegaConf
 from envs.effects import available
 from mpc_sgft.command import choices, cli, compose
 from mpc_sgft.command.errors import Stopped, UserError, from_config
-from mpc_sgft.storage import run_folder
+from tests.probes import probe
 
 ROOT = Path(__file__).resolve().parents[1]
 COMMANDS = ("pretrain", "deploy", "evaluate")
-
-
-def probe(loop: str = "", name: str = "deploy") -> cli.Command:
-    """A command whose loop is a function of this file's helper module."""
-    return cli.Command(name=name, loop=f"probe_loop:{loop}", summary="", values={"method": ("sgft", "zero_shot")})
-
-
-@pytest.fixture
-def loops(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A module of small loops beside an empty working folder, which it returns."""
-    (tmp_path / "probe_loop.py").write_text(
-        "import errno, gc\n"
-        "imported = gc.isenabled()\n"
-        "from mpc_sgft.storage import run_folder\n"
-        "from mpc_sgft.command.errors import Stopped\n"
-        "def folder(cfg):\n    print(run_folder.start(cfg))\n"
-        "def show(cfg):\n    print(cfg.seed, cfg.chosen.gap, cfg.planner.horizon)\n"
-        "def compose_anew(cfg):\n"
-        "    from mpc_sgft.command.compose import compose\n"
-        "    print(cfg.seed, compose('pretrain', ['seed=7'], []).seed)\n"
-        "def stop(cfg):\n    raise Stopped('Saved. Go on with: --resume runs/x')\n"
-        "def full(cfg):\n    raise OSError(errno.ENOSPC, 'No space left on device', 'runs/x/metrics.csv')\n"
-        "def garbage(cfg):\n    print(imported, gc.isenabled(), gc.get_freeze_count() > 0)\n"
-        "def bug(cfg):\n    raise OSError(errno.EPIPE, 'Broken pipe')\n"
-    )
-    monkeypatch.syspath_prepend(str(tmp_path))
-    sys.modules.pop("probe_loop", None)
-    work = tmp_path / "work"
-    work.mkdir()
-    monkeypatch.chdir(work)
-    return work
 
 
 @pytest.mark.parametrize("name", COMMANDS)
@@ -224,52 +192,6 @@ def test_errors_of_our_own_are_not_hidden(loops: Path) -> None:
         cli.run(probe("bug"), [])
 
 
-def test_run_folder_holds_config_and_versions_and_is_the_latest(loops: Path, capsys) -> None:
-    assert cli.run(probe("folder"), ["task=pendulum", "seed=5"]) == 0
-    folder = Path(capsys.readouterr().out.strip())
-    assert folder.parent == loops / "runs" / "pendulum"
-    saved = yaml.safe_load((folder / "config.yaml").read_text())
-    assert (saved["seed"], saved["chosen"]["task"], saved["command"]) == (5, "pendulum", "deploy")
-    versions = json.loads((folder / "versions.json").read_text())
-    assert versions["torch"] and versions["mujoco"] and versions["cpu"]
-    assert (loops / "runs" / "latest").resolve() == (loops / "runs" / "pendulum" / "latest").resolve() == folder
-
-
-def test_runs_of_the_same_second_get_folders_of_their_own(loops: Path, capsys) -> None:
-    assert cli.run(probe("folder"), []) == cli.run(probe("folder"), []) == 0
-    first, second = capsys.readouterr().out.split()
-    assert first != second
-    assert (loops / "runs" / "latest").resolve() == Path(second)
-
-
-def test_a_folder_with_files_is_left_untouched(loops: Path, capsys) -> None:
-    (loops / "mine").mkdir()
-    (loops / "mine" / "summary.json").write_text("{}")
-    assert cli.run(probe("folder"), ["run_dir=mine"]) == 2
-    assert "already holds files" in capsys.readouterr().err
-    assert [p.name for p in (loops / "mine").iterdir()] == ["summary.json"]
-
-
-def test_a_run_dir_below_a_file_is_refused(loops: Path, capsys) -> None:
-    (loops / "file").write_text("")
-    assert cli.run(probe("folder"), ["run_dir=file/run"]) == 2
-    assert "Choose another place with run_dir=" in capsys.readouterr().err
-
-
-def test_resume_takes_the_saved_config_and_its_folder(loops: Path, capsys) -> None:
-    assert cli.run(probe("folder"), ["run_dir=first", "seed=7", "horizon=2"]) == 0
-    assert cli.run(probe("show"), ["--resume", "first"]) == 0
-    assert cli.run(probe("folder"), ["--resume", "first"]) == 0
-    assert capsys.readouterr().out.split("\n")[1:3] == ["7 none 2", str(loops / "first")]
-    assert cli.run(probe("folder"), ["--resume", "first", "horizon=3"]) == 0
-    assert cli.run(probe("show"), ["--resume", "first"]) == 0  # what it was told holds from then on
-    assert capsys.readouterr().out.split("\n")[1] == "7 none 3"
-    assert cli.run(probe("folder"), ["run_dir=whole", "planner.temperature=1"]) == 0  # may have a fraction all the same
-    assert cli.run(probe("show"), ["--resume", "whole", "planner.temperature=0.5"]) == 0
-    assert cli.run(probe("show"), ["--resume", "whole", "rollouts=${nowhere}"]) == 2
-    assert "cannot be resolved" in capsys.readouterr().err
-
-
 def test_a_gap_may_be_a_file(loops: Path, capsys) -> None:
     """As diagnose writes it: names, lists, several places, small numbers, and nothing at all."""
     effects = {
@@ -319,35 +241,6 @@ def test_a_gap_file_that_is_none(text: str | None, words: str, loops: Path, caps
     assert words in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
-    "change",
-    ["task=pendulum", "seed=1", "gap.effects.payload.mass=1", "run_dir=other", "model.mlp_dim=16", "method.lr=1e-5"],
-)
-def test_resume_refuses_to_become_another_run(change: str, loops: Path, capsys) -> None:
-    assert cli.run(probe("folder"), ["run_dir=first"]) == 0
-    assert cli.run(probe("show"), ["--resume", "first", change]) == 2
-    assert "cannot change in a resumed run" in capsys.readouterr().err
-
-
-def test_resume_refuses_the_run_of_another_command(loops: Path, capsys) -> None:
-    assert cli.run(probe("folder"), ["run_dir=first"]) == 0
-    assert cli.run(probe("show", name="evaluate"), ["--resume", "first"]) == 2
-    assert "deploy wrote it" in capsys.readouterr().err
-
-
-def test_a_linked_checkpoint_is_followed_before_the_link_moves(loops: Path) -> None:
-    (loops / "old").mkdir()
-    (loops / "latest").symlink_to("old")
-    cfg = compose.compose("deploy", [compose.normalise("checkpoint=latest")], [])
-    assert cfg.checkpoint == str(loops / "old")
-
-
-def test_latest_that_is_no_link_is_not_replaced(loops: Path) -> None:
-    (loops / "runs" / "latest").mkdir(parents=True)
-    with pytest.raises(UserError, match="not a link"):
-        run_folder.start(compose.compose("deploy", [], []))
-
-
 @pytest.mark.parametrize("name", COMMANDS)
 @pytest.mark.parametrize("experiment", choices.groups()["experiment"])
 def test_experiments_change_numbers_and_add_no_keys(name: str, experiment: str) -> None:
@@ -383,31 +276,3 @@ def test_wrong_values_found_while_building_are_the_users() -> None:
     with pytest.raises(ZeroDivisionError), from_config("planner"):
         raise ZeroDivisionError
     assert issubclass(Stopped, KeyboardInterrupt)
-
-
-@pytest.mark.parametrize(
-    ("change", "says"),
-    [
-        (lambda cfg: cfg.pop("collector"), "it had no collector"),
-        (lambda cfg: cfg.pop("physics"), "it had no physics"),
-        (lambda cfg: cfg.train.agent.pop("td_lambda"), "it had no train.agent.td_lambda"),
-        (lambda cfg: cfg.planner.update(temperature=2.0), "its planner.temperature was in reward units"),
-        (
-            lambda cfg: cfg.collector.update({"_target_": "mpc_sgft.gone.Process"}),
-            "gone.Process has moved since",
-        ),
-        (lambda cfg: None, None),
-        (lambda cfg: (cfg.overrides.append("~train.agent.td_lambda"), cfg.train.agent.pop("td_lambda")), None),
-        (lambda cfg: cfg.gap.effects.update({"actuator_gain": {"gain": 0.9}}), None),
-    ],
-)
-def test_a_run_of_an_earlier_version_is_refused_by_name(tmp_path, change, says):
-    cfg = compose.compose("pretrain", ["task=push"], [])
-    OmegaConf.set_struct(cfg, False)
-    change(cfg)
-    (tmp_path / "config.yaml").write_text(OmegaConf.to_yaml(cfg, resolve=True))
-    if says is None:
-        assert compose.resume("pretrain", str(tmp_path), [], []).resume == str(tmp_path)
-        return
-    with pytest.raises(UserError, match=f"an earlier version wrote it .*{says}.*versions.json"):
-        compose.resume("pretrain", str(tmp_path), [], [])

@@ -367,11 +367,7 @@ def _check_key(cfg: Any, key: str) -> None:
 
 def _check_kind(default: Any, override: Override) -> None:
     value = override.value()
-    if (
-        isinstance(default, int)
-        and not isinstance(default, bool)
-        and override.key_or_group.rpartition(".")[2].isdigit()
-    ):
+    if type(default) is int and override.key_or_group.rpartition(".")[2].isdigit():
         default = float(default)  # of a list, whose other numbers may have fractions
     for kind, allowed, words in KINDS:
         if isinstance(default, kind):

@@ -23,7 +23,7 @@ def check_counts(cfg: DictConfig) -> None:
     for least, keys in enumerate((FROM_ZERO, FROM_ONE)):
         for key in (key for key in keys if key in cfg):
             value = cfg[key]
-            if isinstance(value, float) and value.is_integer():  # 1e6
+            if isinstance(value, float) and value.is_integer():  # 1e6 in a sweep or a file
                 value = cfg[key] = int(value)
             if not isinstance(value, int) or isinstance(value, bool) or value < least:
                 raise UserError(f"{key}={value}: a whole number from {least} on is needed.")

@@ -34,7 +34,7 @@ from mpc_sgft.diagnose.rows import (
     Shown,
     candidate_rows,
     effect_rows,
-    few_windows,
+    notes_of_split,
     reduction,
     trace_rows,
     unit_of,
@@ -124,10 +124,7 @@ def diagnose_run(
             )
             verdict = verdict._replace(kind="unknown", reason=reason)
         bar.update(100 - bar.n)
-    notes = list(deployment.notes)
-    if len(deployment.episodes) == 1:
-        notes.append("one episode only: its end is held out, so that both sides come from the same run")
-    notes += few_windows(setup.held)
+    notes = [*deployment.notes, *notes_of_split(len(deployment.episodes), setup.held)]
     held = verdict.there if traces else verdict.best
     report = assemble(setup, hypotheses, verdict, held, notes, rng, residual_model and residual_model.error)
     if out is not None:

@@ -168,10 +168,14 @@ def fallen(before: Array, after: Array) -> Array:
     return np.where((before == 0) & (after == 0), 0.0, 1 - np.sqrt(after / np.maximum(before, 1e-300)))
 
 
-def few_windows(held: Sequence[int] | Index) -> list[str]:
-    """A note if the windows that are held out are too few for intervals."""
-    says = "one window only is held out: intervals of what is held out have no width; record longer"
-    return [says] if len(held) == 1 else []
+def notes_of_split(episodes: int, held: Sequence[int] | Index) -> list[str]:
+    """What must be said of few episodes, or of few windows that are held out."""
+    notes = []
+    if episodes == 1:
+        notes.append("one episode only: its end is held out, so that both sides come from the same run")
+    if len(held) == 1:
+        notes.append("one window only is held out: intervals of what is held out have no width; record longer")
+    return notes
 
 
 def reduction(signal: str, unit: str, before: Array, after: Array, rng: np.random.Generator) -> dict[str, Any]:

@@ -31,7 +31,7 @@ from mpc_sgft.diagnose.rows import (
     Shown,
     candidate_rows,
     effect_rows,
-    few_windows,
+    notes_of_split,
     reduction,
     trace_rows,
     unit_of,
@@ -143,10 +143,7 @@ def run(
         residual_model = None if settled(best) else fit_residual_model(setup, best, sizes, rng)
         verdict = reach_verdict(setup, hypotheses, residual_model, rng, tolerated)
         bar.update(100 - bar.n)
-    notes = [*plant.notes, *(n for e in recorded for n in e.notes)]
-    if len(recorded) == 1:
-        notes.append("one episode only: its end is held out, so that both sides come from the same run")
-    notes += few_windows(setup.held)
+    notes = [*plant.notes, *(n for e in recorded for n in e.notes), *notes_of_split(len(recorded), setup.held)]
     held = verdict.there if traces else verdict.best
     left = residual_model and residual_model.error
     fitted = setup.problem.replayer

@@ -214,14 +214,14 @@ def start_agent(cfg: DictConfig, env: ControlEnv) -> Agent:
         )
     agent, meta = build.load_agent(cfg)
     build.check_fits(agent.model, env)
-    if cfg.imagined_steps:  # then it is only saved; where the policy climbs the critics it scales its loss
-        agent.scale.value.fill_(agent.model.value_range)
     changed = [part for part in ("command_map", "residual") if meta.get(part)]
     if changed:
         raise UserError(
             f"checkpoint={cfg.checkpoint} comes from a deployment (it has a {changed[0]}): pretraining goes on from "
             "pretrained checkpoints. Give the one that the deployment started from."
         )
+    if cfg.imagined_steps:  # then it is only saved; where the policy climbs the critics it scales its loss
+        agent.scale.value.fill_(agent.model.value_range)
     return agent
 
 

@@ -125,8 +125,9 @@ def _laws(laws: Laws) -> str:
 
 
 def _signals(d: Mapping[str, Any], lines: Lines) -> str:
-    rows, t = {s["signal"]: (i, s["unit"]) for i, s in enumerate(d["signals"])}, lines.time  # the worst first
-    names = sorted(lines.names, key=lambda name: rows.get(name, (len(rows), ""))[0])[:SIGNALS]
+    t, units = lines.time, {s["signal"]: s["unit"] for s in d["signals"]}
+    worst = [name for name in units if name in lines.names]  # first
+    names = [*worst, *(name for name in lines.names if name not in units)][:SIGNALS]
     W, n = t.shape
     pick = list(thinned(n, max(2, POINTS // (len(SERIES) * max(1, len(names)) * W))))
     gap = np.full((W, 1), np.nan)  # windows start anew at the measured state
@@ -134,7 +135,7 @@ def _signals(d: Mapping[str, Any], lines: Lines) -> str:
     figures = []
     for name in names:
         values = [getattr(lines, kind)[..., lines.names.index(name)][:, pick] for kind in SERIES]
-        label = f"{name} [{rows.get(name, (0, ''))[1]}]"
+        label = f"{name} [{units.get(name, '')}]"
         chart = Chart(900, 230, span(t), span(values[0], values[2]), ("time [s]", label), zoom=True)
         for kind, y in zip(SERIES, values, strict=True):
             if n > 1:

@@ -101,10 +101,8 @@ def test_a_run_that_held_its_target_goes_on_only_when_told_to(tmp_path):
     given, numbers = ["pretrain", "--resume", str(tmp_path / "r")], lambda: [r["updates"] for r in rows(tmp_path / "r")]
     assert here("pretrain", f"run_dir={tmp_path / 'r'}", "transitions=1920", *easy).returncode == 0
     before = numbers()
-    assert (
-        "More training: transitions=N min_transitions=N" in here(*given, "transitions=3840").stdout
-        and numbers() == before
-    )
+    said = here(*given, "transitions=3840").stdout
+    assert "More training: transitions=N min_transitions=N" in said and numbers() == before
     assert here(*given, "min_transitions=960").returncode == 0
     assert numbers()[: len(before)] == before and len(numbers()) > len(before)
     before, spent = numbers(), int(json.loads((tmp_path / "r" / "summary.json").read_text())["transitions"])

@@ -55,9 +55,12 @@ def test_pretraining_goes_on_from_a_checkpoint(tmp_path):
     cfg = config(device="cpu")
     env = build.make_env(cfg, 1)
     first = build.make_agent(cfg, env)
+    first.model.value_range = 12.5
     meta = checkpoint.describe(cfg, first.model)
     checkpoint.save(tmp_path / "a.safetensors", first.model, meta)
-    again = start_agent(config(checkpoint=str(tmp_path / "a.safetensors"), seed=7), env)
+    given = {"checkpoint": str(tmp_path / "a.safetensors"), "seed": 7}
+    again = start_agent(config(**given), env)
+    assert float(start_agent(config(**given, imagined_steps=4), env).scale.value) == 12.5 != float(again.scale.value)
     for name, x in first.model.state_dict().items():
         assert torch.equal(x, again.model.state_dict()[name]), name
     fresh = start_agent(config(seed=7), env).model.state_dict()

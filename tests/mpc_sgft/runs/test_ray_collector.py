@@ -111,9 +111,8 @@ def test_a_cluster_that_is_there_is_joined_and_left_as_it_was(tmp_path: Path) ->
                 _, error = run.communicate(timeout=120)
             assert seen and run.returncode == 0, error
             assert head.poll() is None and not workers_of(psutil.Process(head.pid))
-            words[words.index("collector=ray")] = "collector.workers=3"  # more than it has CPUs
-            line = [sys.executable, "-m", "mpc_sgft.pretrain", "--quiet", "collector=ray", "num_envs=8", *words]
-            line = [word.replace(str(tmp_path / "run"), str(tmp_path / "more")) for word in line]
+            more = ["collector.workers=3", f"run_dir={tmp_path / 'more'}"]  # than it has CPUs
+            line = [word for word in line if not word.startswith("run_dir=")] + more
             done = subprocess.run(line, stderr=subprocess.PIPE, text=True, env=own, timeout=120, check=False)
             assert done.returncode == 2 and f"the cluster at {address} has 2 CPUs" in done.stderr, done.stderr
         finally:
