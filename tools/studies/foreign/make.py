@@ -207,7 +207,9 @@ class _Maker:
     ) -> Array:
         """What these parameters change in what is measured, as `blind.detect.trace` says it, [W, T, n + a].
 
-        Of `every` windows one is looked at.
+        Reality begins where its encoders read what they read in the run without effects: names are compared on the same
+        data, and by how little dry friction holds shows a turned encoder to be a tilt. Of `every` windows one is
+        looked at.
         """
         dt = self.case.dt
         lead, total = round(LEAD / dt), round((LEAD + window) / dt)
@@ -216,7 +218,8 @@ class _Maker:
         out = []
         for row, k in zip(*(x[::every] for x in window_starts(seconds, owner, dt, window)), strict=True):
             ctrl = calm[row].ctrl[k : k + total]
-            one = simulate(real, p, (calm[row].q[k], calm[row].v[k]), len(ctrl), dt, ctrl)
+            first = _read_as(p, calm[row].q[k]), calm[row].v[k] / p["sensor_gain"][0]
+            one = simulate(real, p, first, len(ctrl), dt, ctrl)
             begin = one.clean[lead], one.clean_speed[lead]
             two = simulate(model, self.nominal, begin, len(ctrl) - lead, dt, ctrl[lead:])
             apart = (one.clean[lead:] - two.clean) / floor
@@ -282,6 +285,11 @@ class _Maker:
                 columns[f"force/{name}"] = r.force[:, j] + noise
             out.append(columns)
         return out
+
+
+def _read_as(p: Rows, q: Array) -> Array:
+    """Where links are whose encoders read q, [n]."""
+    return (q - p["sensor_offset"][0]) / p["sensor_gain"][0]
 
 
 def rms(traces: Array) -> float:

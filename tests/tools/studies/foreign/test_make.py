@@ -43,6 +43,15 @@ def test_names_that_are_one_term_of_the_equations_are_found_by_simulation(made: 
     assert ["armature"] in cases.label(made)["equivalents"]
 
 
+def test_a_turned_encoder_is_a_tilt_also_where_dry_friction_holds() -> None:
+    """Where friction holds or does not is decided by little: both must be asked on the same data."""
+    first = next(c for c in draw(4, 40, {"arm": 1.0}, MIX) if c.group == "single" and not c.swings)
+    dry = first.nominal | {"dry": [1.3, 0.0]}
+    turned = first._replace(seconds=(3.0,), dt=0.005, noise=1, force_channel=False, nominal=dry)
+    turned = turned._replace(effects=(Given("sensor_offset", 0, 4.0, HALF),))
+    assert make.make([turned], ways=WAYS)[0].truth[0]["equal"] == ["gravity_tilt"]
+
+
 def test_where_forces_are_recorded_no_command_is_late_and_flaws_stay_below_the_border_there() -> None:
     """A force that is read as a command changes would show 50 us as a whole sample."""
     swung = make.make([case("payload")._replace(force_channel=True)], ways=WAYS)[0]
