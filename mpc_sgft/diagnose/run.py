@@ -108,13 +108,13 @@ def run(
     began, rng = time.perf_counter(), np.random.default_rng(seed)
     nominal = nominal_terms(plant, uncertain)
     steps = sorted({min(step, recorded[0].dt) for step in STEPS}, reverse=True)
-    setup = _coarsest(
-        (
-            prepare(plant.sharper(step), recorded, nominal, window=window, signals=signals, held_out=held_out)
-            for step in steps
-        ),
-        UNSEEN,
-    )
+    limits = None if tolerance is None else partial(_limits, plant, tolerance)
+
+    def prepared(step: float) -> Setup[Problem]:
+        scene = plant.sharper(step)
+        return prepare(scene, recorded, nominal, window=window, signals=signals, held_out=held_out, limits=limits)
+
+    setup = _coarsest(map(prepared, steps), UNSEEN)
 
     def nearer(f: Fit, hidden: float = UNSEEN) -> Setup[Problem]:
         return _coarsest((near_fit(setup, f, plant.sharper(step)) for step in steps), hidden)
@@ -166,10 +166,21 @@ def run(
 def tolerance_of(setup: Setup[Problem], tolerance: float | Mapping[str, float | str] | None) -> Tolerance:
     """Prediction errors of the compared signals that may not matter."""
     replayer = setup.problem.replayer
-    measured, signals = replayer.windows.measured, replayer.signals
-    predict, units = _predict(replayer), [_unit(replayer.plant, n) for n in signals]
-    limits = limits_of(tolerance, signals, units, spread_of(measured, predict([setup.baseline])[0], units))
+    measured, predict = replayer.windows.measured, _predict(replayer)
+    limits = _limits(replayer.plant, tolerance, replayer.signals, measured, predict([setup.baseline])[0])
     return Tolerance(limits, predict, measured, setup.noise, tolerance is not None)
+
+
+def _limits(
+    plant: Plant,
+    tolerance: float | Mapping[str, float | str] | None,
+    signals: Sequence[str],
+    measured: Array,
+    predicted: Array,
+) -> Array:
+    """Tolerated error of each signal of a scene, [S]; measured and predicted are [W, n, S]."""
+    units = [_unit(plant, name) for name in signals]
+    return limits_of(tolerance, signals, units, spread_of(measured, predicted, units))
 
 
 def _predict(replayer: Replayer) -> Predict:

@@ -51,6 +51,7 @@ class Setup(Generic[P]):
         squared: What was judged -> that of which shares are taken: the squared error, in units of noise.
         judged: What of a window's error counts when sets are compared; the error itself by default.
         faint: A nominal error that shows nothing if no window has a larger one; -inf where one in the mean decides.
+        tolerated: What the user said does not matter of each signal, beside its noise, [S]; 0 if nothing.
     """
 
     problem: P
@@ -67,6 +68,7 @@ class Setup(Generic[P]):
     near: Fit | None = None
     squared: Callable[[Array], Array] = field(default=np.asarray)
     faint: float = -np.inf
+    tolerated: Array | float = 0.0
 
     def one_window(self, errors: Array) -> bool:
         """Whether several parts of one window may show an effect: where windows are few, and noise alone is left.
@@ -114,8 +116,20 @@ def prepare(
     window: float | None,
     signals: Sequence[str] | None,
     held_out: float | Sequence[str] | None,
+    limits: Callable[[Sequence[str], Array, Array], Array] | None = None,
 ) -> Setup[Problem]:
-    """Cut windows, measure noise and floor, and refit the nominal quantities."""
+    """Cut windows, measure noise and floor, and refit the nominal quantities.
+
+    Args:
+        plant: The scene, in the steps to simulate with.
+        episodes: Measured ones.
+        nominal: Uncertain quantities of the model.
+        window: Length [s]; from the data if None.
+        signals: To compare; positions, forces and known sensors if None.
+        held_out: Share of the data, or names of episodes, that is never fitted; a quarter if None.
+        limits: Signals, measured and predicted [W, n, S] -> error of each that the user said does not matter [S], which
+            is as good as noise that stays off: no evidence is drawn from it. None if nothing was said.
+    """
     chosen = list(signals or default_signals(episodes, plant))
     missing = [s for s in chosen if any(s not in e.signals for e in episodes)]
     if missing:
@@ -139,7 +153,12 @@ def prepare(
     noise = np.minimum(noise, [np.median([noise_of(x) for x in missed[..., i]]) for i in range(len(chosen))])
     encoder = typical(quantum, episodes, chosen) / np.sqrt(12.0)  # hides in what is missed: it rests between two steps
     noise = np.where([s.startswith("qpos/") for s in chosen], np.maximum(noise, encoder), noise)  # a force may jump
-    return _setup(replayer, noise, fitted, held, base, nominal)
+    tolerated: Array | float = 0.0
+    if limits is not None:
+        measured = replayer.windows.measured
+        tolerated = limits(chosen, measured, measured - missed)
+        tolerated = np.where(np.isfinite(tolerated), tolerated, 0.0)  # of signals not named, nothing was said
+    return _setup(replayer, noise, fitted, held, base, nominal, tolerated)
 
 
 def typical(measure: Callable[[Array], float], episodes: Sequence[Episode], signals: Sequence[str]) -> Array:
@@ -165,14 +184,21 @@ def near_fit(setup: Setup[Problem], f: Fit, plant: Plant) -> Setup[Problem]:
         plant: The scene in other steps.
     """
     replayer = setup.problem.replayer.with_plant(plant)
-    return _setup(replayer, setup.noise, setup.fitted, setup.held, f, setup.baseline.terms)
+    return _setup(replayer, setup.noise, setup.fitted, setup.held, f, setup.baseline.terms, setup.tolerated)
 
 
 def _setup(
-    replayer: Replayer, noise: Array, fitted: Index, held: Index, near: Fit, nominal: Sequence[Term]
+    replayer: Replayer,
+    noise: Array,
+    fitted: Index,
+    held: Index,
+    near: Fit,
+    nominal: Sequence[Term],
+    tolerated: Array | float,
 ) -> Setup[Problem]:
     """A problem that is right near a fit, whose first terms are the nominal ones, and its baseline."""
     own = discrepancy(replayer, near.terms, near.values)
+    own = own._replace(doubt=np.hypot(own.doubt, tolerated))
     problem = _problem(replayer, noise, own, near.terms, near.values)
     base = fit(problem, nominal, near.values[: len(nominal)], fitted)
     parts = max(1, -(-UNITS // len(replayer.windows.start)))
@@ -185,7 +211,22 @@ def _setup(
 
     floor, stepping = np.median(own.floor[0], (0, 1)), float(problem.floor_shares[0].mean())
     quiet = NOISE + QUIET
-    return Setup(problem, fitted, held, blocks, base, noise, floor, judged, quiet, parts, stepping, near, np.expm1)
+    return Setup(
+        problem,
+        fitted,
+        held,
+        blocks,
+        base,
+        noise,
+        floor,
+        judged,
+        quiet,
+        parts,
+        stepping,
+        near,
+        np.expm1,
+        tolerated=tolerated,
+    )
 
 
 def leave_out_blocks(fitted: int) -> Index:

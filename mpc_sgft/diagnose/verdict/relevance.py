@@ -150,6 +150,12 @@ def mean_error(setup: Setup[Any], e: Hypothesis, told: Array) -> float:
     return float((told * setup.squared(e.errors)).mean())
 
 
+def errors_by_signal(setup: Setup[Any], e: Hypothesis, told: Array) -> Array:
+    """Mean squared error of each signal in units of noise, floor and tolerance, [S]; told: weights of windows, [W]."""
+    r = setup.problem.residuals(e.fit.terms, [e.fit.values], np.arange(len(told)))[0]
+    return (told[:, None, None] * r.reshape(len(told), setup.problem.blocks, -1) ** 2).mean((0, 1))
+
+
 def simplest(
     setup: Setup[Any], best: Hypothesis, hypotheses: list[Hypothesis], told: Array, spare: float, tolerance: Tolerance
 ) -> Hypothesis:

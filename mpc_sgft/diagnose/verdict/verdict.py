@@ -17,6 +17,7 @@ from mpc_sgft.diagnose.verdict.relevance import (
     MATTERS,
     Relevance,
     by_window,
+    errors_by_signal,
     foretold,
     mean_error,
     shares_of,
@@ -136,24 +137,26 @@ def _no_name(
         share = missed / mean_error(setup, base, told)
         if share > MATTERS:
             return "unknown", f"a flexible residual model explains {share:.1%} more of the error than {_list(there)}"
-    times = np.sqrt(mean_error(setup, best, told))
-    unnamed = not tolerance.allows(there.fit) and _leaves_much(setup, there, base)
+    times, units = np.sqrt(mean_error(setup, best, told)), "noise and floor"
+    if tolerance.asked:
+        units = "noise, floor and tolerance together"
+    unnamed = not tolerance.allows(there.fit) and _leaves_much(setup, there, base, tolerance)
     if unnamed and np.isfinite(setup.faint):
         left = int((there.errors > NOISE).sum())
         windows = f"in {left} of {len(there.errors)} windows, which no name explains"
         return "unknown", f"{_list(there)} leaves more than noise and contacts make {windows}"
     if not best.effects:
-        if tolerance.asked and not settled(base) and unnamed:
+        if tolerance.asked and unnamed:
             return "unknown", "the nominal model's error is beyond the tolerance, and no name explains it"
         if there.effects:
             return "none", f"{_list(there)} is there, and too small to matter"
         if settled(base):
             return "none", "the nominal model's error is within noise and the simulator's floor"
         tried = "no name" if residual_model is None else "no name and no flexible model"
-        return "none", f"{tried} explains the error, {times:.1f} times noise and floor, on windows that were not fitted"
+        return "none", f"{tried} explains the error, {times:.1f} times {units}, on windows that were not fitted"
     if unnamed:
         times = np.sqrt(mean_error(setup, there, told))
-        return "unknown", f"{_list(there)} leaves {times:.1f} times noise and floor, which no name explains"
+        return "unknown", f"{_list(there)} leaves {times:.1f} times {units}, which no name explains"
     return "", ""
 
 
@@ -166,13 +169,17 @@ def _nothing(setup: Setup[Any], base: Hypothesis, tolerance: Tolerance) -> str:
     return ""
 
 
-def _leaves_much(setup: Setup[Any], e: Hypothesis, base: Hypothesis) -> bool:
-    """Whether a set leaves a good part of the nominal model's error.
+def _leaves_much(setup: Setup[Any], e: Hypothesis, base: Hypothesis, tolerance: Tolerance) -> bool:
+    """Whether a set leaves a good part of the nominal model's error; where a tolerance was given, of any signal's.
 
     Objects of a deployment are hit in few windows, and a mean over all says little of those: there it must be in a good
     part of the windows that more is left than noise and contacts make.
     """
     if not np.isfinite(setup.faint):
+        if tolerance.asked:
+            told = by_window(foretold(setup, e), setup)
+            each = zip(*(np.log1p(errors_by_signal(setup, x, told)) for x in (e, base)), strict=True)
+            return any(judge.leaves_much(left, nominal, LEFT) for left, nominal in each)
         return judge.leaves_much(e.error, base.error, LEFT)
     left, nominal = (np.maximum(np.expm1(x.errors) - 1, 0.0) for x in (e, base))
     return bool((left > 0).mean() > LEFT and left.mean() > LEFT * nominal.mean())

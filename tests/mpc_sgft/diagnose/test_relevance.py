@@ -65,6 +65,19 @@ def test_a_simpler_effect_stands_in_within_the_tolerance_alone(slide: Path, reco
         assert [e["name"] for e in report["effects"]] == [name], (tolerance, report["reason"])
 
 
+def test_what_is_tolerated_is_no_evidence_between_names(slide: Path, record: Record) -> None:
+    """A load, more friction than the model knows, and a force that nobody names: the first two look like a weak motor.
+
+    What tells load and motor apart is less than what is tolerated, and what neither explains is as much.
+    """
+    slide.write_text(slide.read_text().replace('axis="1 0 0"/>', 'axis="1 0 0" damping="2"/>'))
+    data = record(seconds=8.0, mass=5.5, viscous=2.16, extra=lambda q, v: 0.3 * np.sin(5 * np.pi * q))
+    effects = ["payload", "actuator_gain"]
+    strict, loose = (diagnose(slide, [data], effects=effects, tolerance=t).as_dict() for t in (None, 0.01))
+    assert strict["verdict"] == "effect" and strict["effects"][0]["name"] == "actuator_gain", strict["reason"]
+    assert loose["verdict"] == "not_identifiable" and loose["ties"][0]["effects"] == ["payload@cart"], loose["reason"]
+
+
 def test_a_repair_that_does_not_repair_is_not_written(slide: Path, record: Record, tmp_path: Path) -> None:
     """Friction that came only after what is held out cannot be seen there."""
     still = record(name="b", seconds=2.0)

@@ -77,6 +77,25 @@ def test_steps_are_as_long_as_noise_hides_their_error(
     assert [steps[name][0] for name in steps] == pytest.approx([searched, judged])
 
 
+def test_what_is_tolerated_is_as_good_as_noise_that_stays_off(slide: Path, record) -> None:
+    """Averaging over samples makes noise less, and not what a model leaves out; also near a fit that is found later."""
+    plant = load_plant(slide).sharper()
+    recorded = episodes(read_table(record(seconds=8.0, noise=1e-3)), plant.actuators, plant.axes())
+
+    def scales(limit: float) -> tuple[np.ndarray, np.ndarray]:
+        def limits(signals: object, measured: np.ndarray, predicted: np.ndarray) -> np.ndarray:
+            assert list(signals) == ["qpos/x"] and measured.shape == predicted.shape  # type: ignore[call-overload]
+            return np.array([limit])
+
+        setup = prepare(plant, recorded, [], window=None, signals=None, held_out=None, limits=limits)
+        return setup.problem.scale, near_fit(setup, setup.baseline, plant).problem.scale
+
+    strict, loose, silent = scales(1e-9), scales(3e-3), scales(np.inf)
+    for before, after, unsaid in zip(strict, loose, silent, strict=True):
+        assert after**2 == pytest.approx(before**2 + 9e-6) and before.max() < 1e-3
+        assert unsaid == pytest.approx(before)
+
+
 def test_sensors_of_the_scene_are_compared_too_and_nothing_that_only_ends_like_one() -> None:
     scene = """<mujoco><worldbody><body><joint name="x" type="slide"/><geom size="0.1" mass="1"/></body></worldbody>
     <actuator><motor name="m" joint="x"/></actuator><sensor><jointpos name="tip" joint="x"/></sensor></mujoco>"""

@@ -15,7 +15,7 @@ from mpc_sgft.diagnose.fitting.hypothesis import Hypothesis, judge_fit
 from mpc_sgft.diagnose.fitting.prepare import NOISE, Setup
 from mpc_sgft.diagnose.fitting.residual_model import ResidualModel
 from mpc_sgft.diagnose.verdict.naming import find_ties, gains
-from mpc_sgft.diagnose.verdict.relevance import certain, what_matters
+from mpc_sgft.diagnose.verdict.relevance import certain, errors_by_signal, what_matters
 from mpc_sgft.diagnose.verdict.uncertainty import intervals
 from mpc_sgft.diagnose.verdict.verdict import reach_verdict
 from tests.mpc_sgft.diagnose.lines import Lines, Points, motion, term
@@ -251,3 +251,21 @@ def test_a_simpler_effect_is_tried_where_traces_hid_it(monkeypatch: pytest.Monke
     best, traces = what_matters(setup, sets[0], [base, *sets], rng, motion(problem, 0.2))
     assert (best.names, [t.term.effect for t in traces]) == (["a"], ["h"])
     assert best.values[0] == pytest.approx(10, abs=0.1)
+
+
+@pytest.mark.parametrize(("asked", "kind"), [(True, "unknown"), (False, "effect")])
+def test_one_signal_of_four_that_nothing_explains_is_unknown_where_it_was_said_how_well_each_must_be_foretold(
+    asked: bool, kind: str
+) -> None:
+    """Three quarters of the points are noise once b is named, in the others 1.7 times the noise is left."""
+    problem, fitted, none, rng = Lines(), np.arange(18), np.zeros(1), np.random.default_rng(5)
+    problem.blocks = 10
+    last = np.arange(40) % 4 == 3
+    problem.y = np.where(last, 1.7, 4 * problem.columns["b"]) + rng.normal(size=problem.y.shape)
+    problem.columns["b"] = np.where(last, 0.0, problem.columns["b"])
+    setup = Setup(problem, fitted, np.arange(18, 24), fitted // 3, fit(problem, [], [], fitted), none, none, np.log1p)
+    setup = replace(setup, squared=np.expm1)
+    sets = [judge_fit(setup, setup.baseline), judge_fit(setup, fit(problem, [term("b")], [np.ones(1)], fitted))]
+    assert errors_by_signal(setup, sets[1], np.ones(24)) == pytest.approx([1, 1, 1, 3.89], rel=0.15)
+    verdict = reach_verdict(setup, sets, None, rng, motion(problem, 0.01, asked=asked))
+    assert (verdict.kind, verdict.best.names) == (kind, ["b"])
