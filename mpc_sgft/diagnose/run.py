@@ -119,7 +119,6 @@ def run(
     def nearer(f: Fit, hidden: float = UNSEEN) -> Setup[Problem]:
         return _coarsest((near_fit(setup, f, plant.sharper(step)) for step in steps), hidden)
 
-    tolerated = tolerance_of(setup, tolerance)
     sharp = plant.sharper()
     sizes = typical_sizes(sharp, setup.problem.replayer)
     with bar_of(100, desc="diagnose", unit="%", disable=not progress) as bar:
@@ -141,7 +140,7 @@ def run(
                 setup, hypotheses = search(setup, terms, max_effects, rng, show)
                 best = choose_set(setup, hypotheses, rng)
         residual_model = None if settled(best) else fit_residual_model(setup, best, sizes, rng)
-        verdict = reach_verdict(setup, hypotheses, residual_model, rng, tolerated)
+        verdict = reach_verdict(setup, hypotheses, residual_model, rng, tolerance_of(setup, tolerance))
         bar.update(100 - bar.n)
     notes = [*plant.notes, *(n for e in recorded for n in e.notes), *notes_of_split(len(recorded), setup.held)]
     held = verdict.there if traces else verdict.best
@@ -168,7 +167,7 @@ def tolerance_of(setup: Setup[Problem], tolerance: float | Mapping[str, float | 
     replayer = setup.problem.replayer
     measured, predict = replayer.windows.measured, _predict(replayer)
     limits = _limits(replayer.plant, tolerance, replayer.signals, measured, predict([setup.baseline])[0])
-    return Tolerance(limits, predict, measured, setup.noise, tolerance is not None)
+    return Tolerance(limits, predict, measured - setup.problem.known, setup.noise, tolerance is not None)
 
 
 def _limits(

@@ -24,7 +24,7 @@ ITERATIONS = 12
 MOST_STEPS = 8  # of a pattern search, of one size
 HOPS = (-2.0, -1.0, -0.5, -0.25, 0.25, 0.5, 1.0, 2.0)  # to neighbouring minima, and around in a narrow one
 OUTLYING = 4.0  # times the median error, or noise
-MOST_FLOOR = 10.0  # times the noise: the simulator's own error weighs a point down by no more
+MOST_FLOOR = 10.0  # times noise and tolerance: the simulator's own error weighs a point down by no more
 
 
 class Fit(NamedTuple):
@@ -96,11 +96,13 @@ class Discrepancy(NamedTuple):
         known: What the simulator's time step leaves out, to be added to predictions, [W, n, S].
         floor: What may be off beyond that, with its sign, terms [F, W, n, S] that add up in squares.
         doubt: Of each sample, beyond its noise, [W, n, S]; as large for its neighbours.
+        tolerated: What the user said does not matter, of each signal, [S]; as large for all samples.
     """
 
     known: Array
     floor: Array
     doubt: Array
+    tolerated: Array
 
 
 class Problem:
@@ -114,21 +116,22 @@ class Problem:
         sensitivity: Derivative of the predictions by the start, [W, n, S, 2 nj].
 
     Attributes:
+        known: What the simulator's time step leaves out, to be added to predictions, [W, n, S].
         floor_shares: Of each residual's expected square, how much each term of the floor makes, 0…1, [F, W, m].
     """
 
     step, pattern = STEP, ()
 
     def __init__(self, replayer: Replayer, sigma: Array, own: Discrepancy, start_sd: Array, sensitivity: Array):
-        self.replayer, self.sigma = replayer, sigma
+        self.replayer, self.sigma, self.known = replayer, sigma, own.known
         n = replayer.windows.samples
         self.stride = max(1, n // MAX_POINTS)
         self.blocks = n // self.stride
         self.target = self._average(replayer.windows.measured - own.known)
-        noise = sigma / np.sqrt(self.stride)
+        hidden = sigma**2 / self.stride + own.tolerated**2
         floors = self._average(own.floor) ** 2
-        floors *= np.minimum(1.0, (MOST_FLOOR * noise) ** 2 / np.maximum(floors.sum(0), 1e-300))
-        self.scale = np.sqrt(noise**2 + floors.sum(0) + self._average(own.doubt) ** 2)
+        floors *= np.minimum(1.0, MOST_FLOOR**2 * hidden / np.maximum(floors.sum(0), 1e-300))
+        self.scale = np.sqrt(hidden + floors.sum(0) + self._average(own.doubt) ** 2)
         self.floor_shares = (floors / self.scale**2).reshape(len(floors), len(self.scale), self.scale[0].size)
         moved = self._average(np.moveaxis(sensitivity, -1, 0)) / self.scale  # [2 nj, W, nb, S]
         a = moved.reshape(*moved.shape[:2], -1).transpose(1, 2, 0) * start_sd[:, None]  # [W, m, 2 nj]

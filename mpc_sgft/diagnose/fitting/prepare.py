@@ -48,7 +48,7 @@ class Setup(Generic[P]):
         parts: Into which each window is cut when sets are compared; a few long windows say more than many short ones.
         stepping: Share of the expected squared error that the simulator's time step makes.
         near: The fit near which it is right; None where nothing depends on that.
-        squared: What was judged -> that of which shares are taken: the squared error, in units of noise.
+        squared: What was judged -> that of which shares are taken: the squared error, in units of noise and tolerance.
         judged: What of a window's error counts when sets are compared; the error itself by default.
         faint: A nominal error that shows nothing if no window has a larger one; -inf where one in the mean decides.
         tolerated: What the user said does not matter of each signal, beside its noise, [S]; 0 if nothing.
@@ -68,7 +68,7 @@ class Setup(Generic[P]):
     near: Fit | None = None
     squared: Callable[[Array], Array] = field(default=np.asarray)
     faint: float = -np.inf
-    tolerated: Array | float = 0.0
+    tolerated: Array = field(default_factory=lambda: np.zeros(1))
 
     def one_window(self, errors: Array) -> bool:
         """Whether several parts of one window may show an effect: where windows are few, and noise alone is left.
@@ -147,13 +147,15 @@ def prepare(
     noise = typical(noise_of, episodes, chosen)
     shape = replayer.windows.measured.shape
     nothing = np.zeros(shape)
-    first = _problem(replayer, noise, Discrepancy(nothing, np.zeros((0, *shape)), nothing), [], [])
+    first = _problem(
+        replayer, noise, Discrepancy(nothing, np.zeros((0, *shape)), nothing, np.zeros(len(chosen))), [], []
+    )
     base = fit(first, nominal, [t.neutral for t in nominal], fitted)
     missed = replayer.windows.measured - replayer.simulate([change_of(nominal, base.values)])[0]
     noise = np.minimum(noise, [np.median([noise_of(x) for x in missed[..., i]]) for i in range(len(chosen))])
     encoder = typical(quantum, episodes, chosen) / np.sqrt(12.0)  # hides in what is missed: it rests between two steps
     noise = np.where([s.startswith("qpos/") for s in chosen], np.maximum(noise, encoder), noise)  # a force may jump
-    tolerated: Array | float = 0.0
+    tolerated = np.zeros(len(chosen))
     if limits is not None:
         measured = replayer.windows.measured
         tolerated = limits(chosen, measured, measured - missed)
@@ -194,11 +196,10 @@ def _setup(
     held: Index,
     near: Fit,
     nominal: Sequence[Term],
-    tolerated: Array | float,
+    tolerated: Array,
 ) -> Setup[Problem]:
     """A problem that is right near a fit, whose first terms are the nominal ones, and its baseline."""
-    own = discrepancy(replayer, near.terms, near.values)
-    own = own._replace(doubt=np.hypot(own.doubt, tolerated))
+    own = discrepancy(replayer, near.terms, near.values, tolerated)
     problem = _problem(replayer, noise, own, near.terms, near.values)
     base = fit(problem, nominal, near.values[: len(nominal)], fitted)
     parts = max(1, -(-UNITS // len(replayer.windows.start)))
@@ -267,7 +268,7 @@ def split(replayer: Any, held_out: float | Sequence[str] | None) -> tuple[Index,
     return everything[~apart], everything[apart]
 
 
-def discrepancy(replayer: Replayer, terms: Sequence[Term], values: Sequence[Array]) -> Discrepancy:
+def discrepancy(replayer: Replayer, terms: Sequence[Term], values: Sequence[Array], tolerated: Array) -> Discrepancy:
     """How far predictions are off although the model is right.
 
     By the simulator's time step: what steps a quarter as long change is taken off; what is left of a second-order error
@@ -290,7 +291,7 @@ def discrepancy(replayer: Replayer, terms: Sequence[Term], values: Sequence[Arra
     )
     unsure = (w.acting == EITHER).all(-1)[..., None]
     floor = np.stack([step, np.where(unsure, 0.0, clock)])
-    return Discrepancy(quarter - predicted, floor, np.where(unsure, np.abs(clock) / 2, 0.0))
+    return Discrepancy(quarter - predicted, floor, np.where(unsure, np.abs(clock) / 2, 0.0), tolerated)
 
 
 def _problem(

@@ -15,7 +15,7 @@ from mpc_sgft.diagnose.simulation.plant import Change
 
 WINDOWS = 16  # to simulate
 LOAD = 0.5  # of the body's mass
-CLEAR = 3.0  # times the noise: a separation below is not worth an experiment
+CLEAR = 3.0  # times what hides it: a separation below is not worth an experiment
 
 
 def _at_speed(ctrl: Array, speed: float) -> Array:
@@ -37,7 +37,7 @@ def _command_changes() -> dict[str, Callable[[Array], Array]]:
 
 
 def next_experiment(setup: Setup, tied: Sequence[Hypothesis]) -> str:
-    """Words for the proposal that separates the tied candidates best, and by how many times the noise."""
+    """Words for the proposal that separates the tied candidates best, and by how many times what hides them."""
     problem = setup.problem
     pick = setup.fitted[np.unique(np.linspace(0, len(setup.fitted) - 1, WINDOWS).astype(int))]
     changes = [change_of(e.fit.terms, e.fit.values) for e in tied[:4]]
@@ -49,21 +49,23 @@ def next_experiment(setup: Setup, tied: Sequence[Hypothesis]) -> str:
         loaded = [c + Change(edits=(_load(body, LOAD * _mass(setup, body)),)) for c in changes]
         words = f"another load: {LOAD * _mass(setup, body):.3g} kg, weighed, on {body}"
         outcomes[words] = separation(problem.whiten(problem.replayer.simulate(loaded, pick), pick))
-    return best_of(outcomes, "motions and loads", "measure a force, a current or the load itself")
+    hides = "noise and tolerance" if np.any(setup.tolerated) else "the noise"
+    return best_of(outcomes, "motions and loads", "measure a force, a current or the load itself", hides)
 
 
-def best_of(outcomes: dict[str, float], tried: str, otherwise: str) -> str:
+def best_of(outcomes: dict[str, float], tried: str, otherwise: str, hides: str = "the noise") -> str:
     """The experiment that separates best, in words; what to do otherwise if none does clearly.
 
     Args:
-        outcomes: Experiment in words -> difference of the closest candidates, in units of the noise.
+        outcomes: Experiment in words -> difference of the closest candidates, in units of what hides it.
         tried: What the experiments are, in words.
         otherwise: What else would tell.
+        hides: What hides differences, in words.
     """
     words, size = max(outcomes.items(), key=lambda item: item[1])
     if size < CLEAR:
-        return f"none of the simulated {tried} separates them (best: {words}, {size:.1f} times the noise); {otherwise}"
-    return f"{words} (simulated, the candidates then differ by {size:.1f} times the noise)"
+        return f"none of the simulated {tried} separates them (best: {words}, {size:.1f} times {hides}); {otherwise}"
+    return f"{words} (simulated, the candidates then differ by {size:.1f} times {hides})"
 
 
 def separation(r: Array) -> float:

@@ -31,7 +31,7 @@ class Tolerance:
     Args:
         limits: Of each signal in its unit, [S]; infinite where any error will do.
         predict: Fits -> predictions.
-        measured: [W, n, S].
+        measured: [W, n, S], without what the simulator's time step is known to leave out.
         noise: Of each signal, [S].
         asked: Whether the user gave it: what is within it then does not matter, however large a share of the error.
     """

@@ -138,7 +138,7 @@ def _no_name(
         if share > MATTERS:
             return "unknown", f"a flexible residual model explains {share:.1%} more of the error than {_list(there)}"
     times, units = np.sqrt(mean_error(setup, best, told)), "noise and floor"
-    if tolerance.asked:
+    if np.any(setup.tolerated):
         units = "noise, floor and tolerance together"
     unnamed = not tolerance.allows(there.fit) and _leaves_much(setup, there, base, tolerance)
     if unnamed and np.isfinite(setup.faint):
@@ -151,7 +151,10 @@ def _no_name(
         if there.effects:
             return "none", f"{_list(there)} is there, and too small to matter"
         if settled(base):
-            return "none", "the nominal model's error is within noise and the simulator's floor"
+            within = "noise and the simulator's floor"
+            if np.any(setup.tolerated):
+                within = "noise, the simulator's floor and the tolerance together"
+            return "none", f"the nominal model's error is within {within}"
         tried = "no name" if residual_model is None else "no name and no flexible model"
         return "none", f"{tried} explains the error, {times:.1f} times {units}, on windows that were not fitted"
     if unnamed:
@@ -170,7 +173,7 @@ def _nothing(setup: Setup[Any], base: Hypothesis, tolerance: Tolerance) -> str:
 
 
 def _leaves_much(setup: Setup[Any], e: Hypothesis, base: Hypothesis, tolerance: Tolerance) -> bool:
-    """Whether a set leaves a good part of the nominal model's error; where a tolerance was given, of any signal's.
+    """Whether a set leaves a good part of the nominal model's error; where a tolerance was given, of any signal named.
 
     Objects of a deployment are hit in few windows, and a mean over all says little of those: there it must be in a good
     part of the windows that more is left than noise and contacts make.
@@ -178,8 +181,8 @@ def _leaves_much(setup: Setup[Any], e: Hypothesis, base: Hypothesis, tolerance: 
     if not np.isfinite(setup.faint):
         if tolerance.asked:
             told = by_window(foretold(setup, e), setup)
-            each = zip(*(np.log1p(errors_by_signal(setup, x, told)) for x in (e, base)), strict=True)
-            return any(judge.leaves_much(left, nominal, LEFT) for left, nominal in each)
+            left, nominal = (errors_by_signal(setup, x, told) for x in (e, base))
+            return bool((np.isfinite(tolerance.limits) & (left > 1) & (left > LEFT * nominal)).any())
         return judge.leaves_much(e.error, base.error, LEFT)
     left, nominal = (np.maximum(np.expm1(x.errors) - 1, 0.0) for x in (e, base))
     return bool((left > 0).mean() > LEFT and left.mean() > LEFT * nominal.mean())

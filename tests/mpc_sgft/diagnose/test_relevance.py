@@ -78,6 +78,16 @@ def test_what_is_tolerated_is_no_evidence_between_names(slide: Path, record: Rec
     assert loose["verdict"] == "not_identifiable" and loose["ties"][0]["effects"] == ["payload@cart"], loose["reason"]
 
 
+@pytest.mark.parametrize(("tolerance", "verdict"), [("40mm", "unknown"), ("50mm", "none")])
+def test_an_error_that_nothing_explains_is_unknown_from_the_tolerance_on(
+    slide: Path, record: Record, tolerance: str, verdict: str
+) -> None:
+    """A force that nobody names moves the slide by 46 mm, root mean square."""
+    data = record(seconds=8.0, extra=lambda q, v: 3.0 * np.sin(5 * np.pi * q))
+    report = diagnose(slide, [data], effects=["actuator_offset"], tolerance={"qpos/x": tolerance}).as_dict()
+    assert report["verdict"] == verdict, report["reason"]
+
+
 def test_a_repair_that_does_not_repair_is_not_written(slide: Path, record: Record, tmp_path: Path) -> None:
     """Friction that came only after what is held out cannot be seen there."""
     still = record(name="b", seconds=2.0)

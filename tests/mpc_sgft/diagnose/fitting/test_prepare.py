@@ -16,7 +16,7 @@ from mpc_sgft.diagnose.data.check import episodes
 from mpc_sgft.diagnose.data.measured import Episode, read_table, write_csv
 from mpc_sgft.diagnose.data.smooth import noise_of
 from mpc_sgft.diagnose.fitting import search as searching
-from mpc_sgft.diagnose.fitting.fit import fit
+from mpc_sgft.diagnose.fitting.fit import Discrepancy, fit
 from mpc_sgft.diagnose.fitting.hypothesis import Hypothesis, judge_fit
 from mpc_sgft.diagnose.fitting.prepare import Problem, Setup, default_signals, near_fit, prepare, typical, typical_sizes
 from mpc_sgft.diagnose.simulation.plant import Plant, load_plant
@@ -94,6 +94,16 @@ def test_what_is_tolerated_is_as_good_as_noise_that_stays_off(slide: Path, recor
     for before, after, unsaid in zip(strict, loose, silent, strict=True):
         assert after**2 == pytest.approx(before**2 + 9e-6) and before.max() < 1e-3
         assert unsaid == pytest.approx(before)
+
+
+def test_steps_that_are_off_by_more_than_is_tolerated_show(dry) -> None:
+    """However little noise there is: an error of three tolerances is nine tenths of what may be expected."""
+    _, setup = dry
+    replayer = setup.problem.replayer
+    shape, states = replayer.windows.measured.shape, 2 * len(replayer.plant.joints)
+    own = Discrepancy(np.zeros(shape), np.full((1, *shape), 3e-3), np.zeros(shape), np.array([1e-3]))
+    made = Problem(replayer, np.array([1e-7]), own, np.zeros((shape[0], states)), np.zeros((*shape, states)))
+    assert made.floor_shares == pytest.approx(0.9) and made.scale == pytest.approx(np.sqrt(10) * 1e-3)
 
 
 def test_sensors_of_the_scene_are_compared_too_and_nothing_that_only_ends_like_one() -> None:

@@ -16,6 +16,7 @@ from mpc_sgft.diagnose.fitting.prepare import NOISE, Setup
 from mpc_sgft.diagnose.fitting.residual_model import ResidualModel
 from mpc_sgft.diagnose.verdict.naming import find_ties, gains
 from mpc_sgft.diagnose.verdict.relevance import certain, errors_by_signal, what_matters
+from mpc_sgft.diagnose.verdict.tolerance import Tolerance
 from mpc_sgft.diagnose.verdict.uncertainty import intervals
 from mpc_sgft.diagnose.verdict.verdict import reach_verdict
 from tests.mpc_sgft.diagnose.lines import Lines, Points, motion, term
@@ -253,9 +254,12 @@ def test_a_simpler_effect_is_tried_where_traces_hid_it(monkeypatch: pytest.Monke
     assert best.values[0] == pytest.approx(10, abs=0.1)
 
 
-@pytest.mark.parametrize(("asked", "kind"), [(True, "unknown"), (False, "effect")])
-def test_one_signal_of_four_that_nothing_explains_is_unknown_where_it_was_said_how_well_each_must_be_foretold(
-    asked: bool, kind: str
+@pytest.mark.parametrize(
+    ("asked", "limits", "kind"),
+    [(True, [0.1] * 4, "unknown"), (True, [0.1] * 3 + [np.inf], "effect"), (False, [0.1] * 4, "effect")],
+)
+def test_one_signal_of_four_that_nothing_explains_is_unknown_where_it_was_said_how_well_it_must_be_foretold(
+    asked: bool, limits: list[float], kind: str
 ) -> None:
     """Three quarters of the points are noise once b is named, in the others 1.7 times the noise is left."""
     problem, fitted, none, rng = Lines(), np.arange(18), np.zeros(1), np.random.default_rng(5)
@@ -267,5 +271,13 @@ def test_one_signal_of_four_that_nothing_explains_is_unknown_where_it_was_said_h
     setup = replace(setup, squared=np.expm1)
     sets = [judge_fit(setup, setup.baseline), judge_fit(setup, fit(problem, [term("b")], [np.ones(1)], fitted))]
     assert errors_by_signal(setup, sets[1], np.ones(24)) == pytest.approx([1, 1, 1, 3.89], rel=0.15)
-    verdict = reach_verdict(setup, sets, None, rng, motion(problem, 0.01, asked=asked))
-    assert (verdict.kind, verdict.best.names) == (kind, ["b"])
+    line = motion(problem, asked=asked)
+    tolerance = Tolerance(
+        np.array(limits),
+        lambda fits: line.predict(fits).reshape(len(fits), 24, 10, 4),
+        problem.y.reshape(24, 10, 4),
+        0.9 * np.ones(4),
+        asked,
+    )
+    assert not tolerance.allows(sets[1].fit)
+    assert (reach_verdict(setup, sets, None, rng, tolerance).kind) == kind
