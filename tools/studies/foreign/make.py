@@ -218,7 +218,7 @@ class _Maker:
         out = []
         for row, k in zip(*(x[::every] for x in window_starts(seconds, owner, dt, window)), strict=True):
             ctrl = calm[row].ctrl[k : k + total]
-            first = _read_as(p, calm[row].q[k]), calm[row].v[k] / p["sensor_gain"][0]
+            first = _read_as(p, calm[row].clean[k], calm[row].clean_speed[k])
             one = simulate(real, p, first, len(ctrl), dt, ctrl)
             begin = one.clean[lead], one.clean_speed[lead]
             two = simulate(model, self.nominal, begin, len(ctrl) - lead, dt, ctrl[lead:])
@@ -287,9 +287,10 @@ class _Maker:
         return out
 
 
-def _read_as(p: Rows, q: Array) -> Array:
-    """Where links are whose encoders read q, [n]."""
-    return (q - p["sensor_offset"][0]) / p["sensor_gain"][0]
+def _read_as(p: Rows, position: Array, speed: Array) -> tuple[Array, Array]:
+    """Where links are, and how fast, whose encoders read this at once, [n] each."""
+    gain = p["sensor_gain"][0]
+    return (position - p["sensor_offset"][0]) / gain, speed / gain
 
 
 def rms(traces: Array) -> float:
