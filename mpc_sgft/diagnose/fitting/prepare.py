@@ -128,7 +128,7 @@ def prepare(
         signals: To compare; positions, forces and known sensors if None.
         held_out: Share of the data, or names of episodes, that is never fitted; a quarter if None.
         limits: Signals, measured and predicted [W, n, S] -> error of each that the user said does not matter [S], which
-            is as good as noise that stays off: no evidence is drawn from it. None if nothing was said.
+            is taken for noise that stays off. None if nothing was said.
     """
     chosen = list(signals or default_signals(episodes, plant))
     missing = [s for s in chosen if any(s not in e.signals for e in episodes)]
