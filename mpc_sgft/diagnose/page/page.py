@@ -163,7 +163,7 @@ def _candidates(d: Mapping[str, Any]) -> str:
         TOP + BOTTOM + ROW * len(rows),
         (low, high),
         (0, 1),
-        ("mean of log(1 + squared error in units of noise and tolerance) on windows that were not fitted", ""),
+        ("mean of log(1 + squared error in units of noise) on windows that were not fitted", ""),
         left=NAMES,
         right=TOLD,
     )
@@ -173,8 +173,8 @@ def _candidates(d: Mapping[str, Any]) -> str:
         chart.bar(i, len(rows), r["held_out_error"], kind, _short(" + ".join(r["effects"]) or "nominal", 36), told)
         chart.whisker(i, len(rows), r["low"], r["high"])
     return (
-        "<h2>What else was tried</h2><p>Shorter is better; the thin line is the 90 % interval. Noise leaves 0.69, and "
-        "so do noise and all that a tolerance allows. Green is the answer and what ties with it.</p>"
+        "<h2>What else was tried</h2><p>Shorter is better; the thin line is the 90 % interval. Noise alone leaves "
+        "0.69. What a tolerance allows counts as noise. Green is the answer and what ties with it.</p>"
         f"<figure>{chart.svg('candidates by error', y_ticks=False)}</figure>"
     )
 

@@ -146,7 +146,7 @@ def by_window(told: Array, setup: Setup[Any]) -> Array:
 
 
 def mean_error(setup: Setup[Any], e: Hypothesis, told: Array) -> float:
-    """Mean squared error of weighted windows, in units of noise."""
+    """Mean squared error of weighted windows, in units of noise, floor and tolerance."""
     return float((told * setup.squared(e.errors)).mean())
 
 
@@ -154,6 +154,13 @@ def errors_by_signal(setup: Setup[Any], e: Hypothesis, told: Array) -> Array:
     """Mean squared error of each signal in units of noise, floor and tolerance, [S]; told: weights of windows, [W]."""
     r = setup.problem.residuals(e.fit.terms, [e.fit.values], np.arange(len(told)))[0]
     return (told[:, None, None] * r.reshape(len(told), setup.problem.blocks, -1) ** 2).mean((0, 1))
+
+
+def noise_shares(setup: Setup[Any]) -> Array:
+    """How much of those units is noise and floor, 0…1, [S]; [1] where nothing is tolerated."""
+    if not np.any(setup.tolerated):
+        return np.ones(1)
+    return 1 - (setup.tolerated**2 / setup.problem.scale**2).mean((0, 1))
 
 
 def simplest(

@@ -20,6 +20,7 @@ from mpc_sgft.diagnose.verdict.relevance import (
     errors_by_signal,
     foretold,
     mean_error,
+    noise_shares,
     shares_of,
     what_matters,
 )
@@ -159,6 +160,9 @@ def _no_name(
         return "none", f"{tried} explains the error, {times:.1f} times {units}, on windows that were not fitted"
     if unnamed:
         times = np.sqrt(mean_error(setup, there, told))
+        if tolerance.asked:
+            each = errors_by_signal(setup, there, by_window(told, setup))
+            times = np.sqrt(each[np.broadcast_to(np.isfinite(tolerance.limits), each.shape)].max())
         return "unknown", f"{_list(there)} leaves {times:.1f} times {units}, which no name explains"
     return "", ""
 
@@ -182,7 +186,8 @@ def _leaves_much(setup: Setup[Any], e: Hypothesis, base: Hypothesis, tolerance: 
         if tolerance.asked:
             told = by_window(foretold(setup, e), setup)
             left, nominal = (errors_by_signal(setup, x, told) for x in (e, base))
-            return bool((np.isfinite(tolerance.limits) & (left > 1) & (left > LEFT * nominal)).any())
+            most = 1 + judge.NEAR * noise_shares(setup)  # noise is not quite known, and a tolerance is
+            return bool((np.isfinite(tolerance.limits) & (left > most) & (left > LEFT * nominal)).any())
         return judge.leaves_much(e.error, base.error, LEFT)
     left, nominal = (np.maximum(np.expm1(x.errors) - 1, 0.0) for x in (e, base))
     return bool((left > 0).mean() > LEFT and left.mean() > LEFT * nominal.mean())

@@ -88,6 +88,14 @@ def test_an_error_that_nothing_explains_is_unknown_from_the_tolerance_on(
     assert report["verdict"] == verdict, report["reason"]
 
 
+def test_noise_beyond_a_tolerance_is_nothing_unknown(slide: Path, record: Record) -> None:
+    """Ten times the tolerance; what windows scatter around it is no sign of something that is missing."""
+    for seed in range(4):
+        data = record(name=f"seed{seed}", seconds=4.0, noise=1e-3, seed=seed)
+        report = diagnose(slide, [data], effects=["actuator_offset"], tolerance={"qpos/x": "0.1mm"}).as_dict()
+        assert report["verdict"] == "none", (seed, report["reason"])
+
+
 def test_a_repair_that_does_not_repair_is_not_written(slide: Path, record: Record, tmp_path: Path) -> None:
     """Friction that came only after what is held out cannot be seen there."""
     still = record(name="b", seconds=2.0)
