@@ -17,7 +17,7 @@ def blind() -> str:
 
 def foreign() -> str:
     parts = []
-    for file in ("foreign", "imperfect", "engines", "engines_again", "earlier"):
+    for file in ("foreign", "imperfect", "engines", "engines_again", "tolerated", "earlier"):
         rows = read(f"foreign/{file}.csv")
         parts.append(f"Seed {rows[0]['seed']}:\n\n{by_ground(rows)}")
     return "\n\n".join(parts)

@@ -6,7 +6,7 @@
 `--cases` are those of each ground. Every case has small imperfections of everything; its label holds the effects that
 move predictions by more than a tolerance which the solver is told. The labels' SHA-256 is printed before the solver
 starts, and checked before scoring. What is on disk is not done again. A seed that was used to tune the solver must not
-be reported: 1 to 7, 1031, 2077, 3163, 4219 and 5261. The CSV has one row a score; beside it goes <csv>_cases.csv
+be reported: 1 to 7, 1031, 2077, 3163, 4219, 5261 and 6367. The CSV has one row a score; beside it goes <csv>_cases.csv
 with one row a case.
 """
 
