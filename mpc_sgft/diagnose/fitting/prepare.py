@@ -211,7 +211,6 @@ def _setup(
         return np.log1p(np.maximum(errors, least))
 
     floor, stepping = np.median(own.floor[0], (0, 1)), float(problem.floor_shares[0].mean())
-    quiet = NOISE + QUIET
     return Setup(
         problem,
         fitted,
@@ -220,12 +219,12 @@ def _setup(
         base,
         noise,
         floor,
-        judged,
-        quiet,
-        parts,
-        stepping,
-        near,
-        np.expm1,
+        judged=judged,
+        quiet=NOISE + QUIET,
+        parts=parts,
+        stepping=stepping,
+        near=near,
+        squared=np.expm1,
         tolerated=tolerated,
     )
 

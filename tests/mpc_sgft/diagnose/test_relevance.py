@@ -65,7 +65,7 @@ def test_a_simpler_effect_stands_in_within_the_tolerance_alone(slide: Path, reco
         assert [e["name"] for e in report["effects"]] == [name], (tolerance, report["reason"])
 
 
-def test_what_is_tolerated_is_no_evidence_between_names(slide: Path, record: Record) -> None:
+def test_what_is_tolerated_is_little_evidence_between_names(slide: Path, record: Record) -> None:
     """A load, more friction than the model knows, and a force that nobody names: the first two look like a weak motor.
 
     What tells load and motor apart is less than what is tolerated, and what neither explains is as much.

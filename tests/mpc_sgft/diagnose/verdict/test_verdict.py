@@ -280,4 +280,4 @@ def test_one_signal_of_four_that_nothing_explains_is_unknown_where_it_was_said_h
         asked,
     )
     assert not tolerance.allows(sets[1].fit)
-    assert (reach_verdict(setup, sets, None, rng, tolerance).kind) == kind
+    assert reach_verdict(setup, sets, None, rng, tolerance).kind == kind
