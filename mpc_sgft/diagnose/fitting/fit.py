@@ -96,13 +96,11 @@ class Discrepancy(NamedTuple):
         known: What the simulator's time step leaves out, to be added to predictions, [W, n, S].
         floor: What may be off beyond that, with its sign, terms [F, W, n, S] that add up in squares.
         doubt: Of each sample, beyond its noise, [W, n, S]; as large for its neighbours.
-        tolerated: What the user said does not matter, of each signal, [S]; as large for all samples.
     """
 
     known: Array
     floor: Array
     doubt: Array
-    tolerated: Array
 
 
 class Problem:
@@ -112,6 +110,7 @@ class Problem:
         replayer: Simulates.
         sigma: Noise of each signal, one sample, [S].
         own: Errors of the simulator itself.
+        tolerated: What of each signal does not matter, [S]; averaging does not make it less.
         start_sd: Uncertainty of each window's start, [W, 2 nj]; projected out.
         sensitivity: Derivative of the predictions by the start, [W, n, S, 2 nj].
 
@@ -122,13 +121,21 @@ class Problem:
 
     step, pattern = STEP, ()
 
-    def __init__(self, replayer: Replayer, sigma: Array, own: Discrepancy, start_sd: Array, sensitivity: Array):
+    def __init__(
+        self,
+        replayer: Replayer,
+        sigma: Array,
+        own: Discrepancy,
+        tolerated: Array,
+        start_sd: Array,
+        sensitivity: Array,
+    ):
         self.replayer, self.sigma, self.known = replayer, sigma, own.known
         n = replayer.windows.samples
         self.stride = max(1, n // MAX_POINTS)
         self.blocks = n // self.stride
         self.target = self._average(replayer.windows.measured - own.known)
-        hidden = sigma**2 / self.stride + own.tolerated**2
+        hidden = sigma**2 / self.stride + tolerated**2
         floors = self._average(own.floor) ** 2
         floors *= np.minimum(1.0, MOST_FLOOR**2 * hidden / np.maximum(floors.sum(0), 1e-300))
         self.scale = np.sqrt(hidden + floors.sum(0) + self._average(own.doubt) ** 2)

@@ -147,15 +147,13 @@ def prepare(
     noise = typical(noise_of, episodes, chosen)
     shape = replayer.windows.measured.shape
     nothing = np.zeros(shape)
-    first = _problem(
-        replayer, noise, Discrepancy(nothing, np.zeros((0, *shape)), nothing, np.zeros(len(chosen))), [], []
-    )
+    tolerated = np.zeros(len(chosen))
+    first = _problem(replayer, noise, Discrepancy(nothing, np.zeros((0, *shape)), nothing), tolerated, [], [])
     base = fit(first, nominal, [t.neutral for t in nominal], fitted)
     missed = replayer.windows.measured - replayer.simulate([change_of(nominal, base.values)])[0]
     noise = np.minimum(noise, [np.median([noise_of(x) for x in missed[..., i]]) for i in range(len(chosen))])
     encoder = typical(quantum, episodes, chosen) / np.sqrt(12.0)  # hides in what is missed: it rests between two steps
     noise = np.where([s.startswith("qpos/") for s in chosen], np.maximum(noise, encoder), noise)  # a force may jump
-    tolerated = np.zeros(len(chosen))
     if limits is not None:
         measured = replayer.windows.measured
         tolerated = limits(chosen, measured, measured - missed)
@@ -199,8 +197,8 @@ def _setup(
     tolerated: Array,
 ) -> Setup[Problem]:
     """A problem that is right near a fit, whose first terms are the nominal ones, and its baseline."""
-    own = discrepancy(replayer, near.terms, near.values, tolerated)
-    problem = _problem(replayer, noise, own, near.terms, near.values)
+    own = discrepancy(replayer, near.terms, near.values)
+    problem = _problem(replayer, noise, own, tolerated, near.terms, near.values)
     base = fit(problem, nominal, near.values[: len(nominal)], fitted)
     parts = max(1, -(-UNITS // len(replayer.windows.start)))
     blocks = leave_out_blocks(len(fitted))
@@ -267,7 +265,7 @@ def split(replayer: Any, held_out: float | Sequence[str] | None) -> tuple[Index,
     return everything[~apart], everything[apart]
 
 
-def discrepancy(replayer: Replayer, terms: Sequence[Term], values: Sequence[Array], tolerated: Array) -> Discrepancy:
+def discrepancy(replayer: Replayer, terms: Sequence[Term], values: Sequence[Array]) -> Discrepancy:
     """How far predictions are off although the model is right.
 
     By the simulator's time step: what steps a quarter as long change is taken off; what is left of a second-order error
@@ -290,13 +288,14 @@ def discrepancy(replayer: Replayer, terms: Sequence[Term], values: Sequence[Arra
     )
     unsure = (w.acting == EITHER).all(-1)[..., None]
     floor = np.stack([step, np.where(unsure, 0.0, clock)])
-    return Discrepancy(quarter - predicted, floor, np.where(unsure, np.abs(clock) / 2, 0.0), tolerated)
+    return Discrepancy(quarter - predicted, floor, np.where(unsure, np.abs(clock) / 2, 0.0))
 
 
 def _problem(
     replayer: Replayer,
     noise: Array,
     own: Discrepancy,
+    tolerated: Array,
     terms: Sequence[Term],
     values: Sequence[Array],
 ) -> Problem:
@@ -311,7 +310,7 @@ def _problem(
     y = replayer.simulate([change] * len(shifts), shift=shifts)
     half = len(kick)
     sensitivity = np.moveaxis((y[:half] - y[half:]) / (2 * kick[:, None, None, None]), 0, -1)
-    return Problem(replayer, noise, own, sd, sensitivity)
+    return Problem(replayer, noise, own, tolerated, sd, sensitivity)
 
 
 def typical_sizes(plant: Plant, replayer: Replayer) -> dict[tuple[str, str], TypicalSizes]:

@@ -101,13 +101,15 @@ def test_steps_that_are_off_by_more_than_is_tolerated_show(dry) -> None:
     _, setup = dry
     replayer = setup.problem.replayer
     shape, states = replayer.windows.measured.shape, 2 * len(replayer.plant.joints)
-    own = Discrepancy(np.zeros(shape), np.full((1, *shape), 3e-3), np.zeros(shape), np.array([1e-3]))
-    made = Problem(replayer, np.array([1e-7]), own, np.zeros((shape[0], states)), np.zeros((*shape, states)))
+    own = Discrepancy(np.zeros(shape), np.full((1, *shape), 3e-3), np.zeros(shape))
+    made = Problem(
+        replayer, np.array([1e-7]), own, np.array([1e-3]), np.zeros((shape[0], states)), np.zeros((*shape, states))
+    )
     assert made.floor_shares == pytest.approx(0.9) and made.scale == pytest.approx(np.sqrt(10) * 1e-3)
 
 
 def test_what_steps_are_known_to_leave_out_is_no_error_of_the_model(slide: Path, moved, tmp_path: Path) -> None:
-    """A stiff slide, recorded in steps of a hundredth: in its own it is off by 1.8 tolerances, of which all is known."""
+    """A stiff slide, recorded in steps of a hundredth: in its own it is off by 1.8 tolerances, as is known."""
     slide.write_text(slide.read_text().replace('axis="1 0 0"/>', 'axis="1 0 0" stiffness="20000" damping="20"/>'))
     model = mujoco.MjModel.from_xml_path(str(slide))
     model.opt.timestep, model.opt.integrator = 2e-5, mujoco.mjtIntegrator.mjINT_RK4
