@@ -60,9 +60,13 @@ def test_the_page_holds_the_answer_in_words_charts_and_a_diff(report: Path) -> N
     assert "<b>odd" not in page
 
 
-def test_no_error_and_no_sideways_scroll_in_a_browser(report: Path, browser: str, tmp_path: Path) -> None:
+def test_no_error_and_no_sideways_scroll_in_a_browser(
+    slide: Path, record: Callable[..., Path], browser: str, tmp_path: Path
+) -> None:
+    data = [record(name=name, seconds=3.0, coulomb=2.0) for name in ("one", "<b>odd")]
+    diagnose(slide, data, effects=["coulomb_friction", "viscous_friction"], out=tmp_path / "out")
     probe = tmp_path / "probe.html"
-    probe.write_text(report.read_text().replace("</body>", PROBE + "</body>"))
+    probe.write_text((tmp_path / "out" / "report.html").read_text().replace("</body>", PROBE + "</body>"))
     given = ["--headless", "--no-sandbox", "--disable-gpu", "--allow-file-access-from-files", "--enable-logging=stderr"]
     given += ["--no-first-run", "--disable-background-networking", "--disable-component-update", "--disable-sync"]
     given += [f"--user-data-dir={tmp_path / 'profile'}", "--virtual-time-budget=5000", "--window-size=1600,1000"]

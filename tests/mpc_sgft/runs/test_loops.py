@@ -68,7 +68,8 @@ def pretrained(tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def deployed(pretrained, tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("runs") / "deployed"
-    done = run("deploy", f"checkpoint={pretrained}", "gap=pendulum_torque", f"run_dir={folder}", "rollouts=4")
+    words = ["gap=pendulum_torque", f"run_dir={folder}", "rollouts=4", "method.updates=25"]
+    done = run("deploy", f"checkpoint={pretrained}", *words)
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout.splitlines()[-1]) == json.loads((folder / "summary.json").read_text())
     return folder
