@@ -44,6 +44,8 @@ class AbstractMethod(ABC):
             the pretrained dynamics with the maps to this share, looked at as the gate does in rollouts that failed; 0:
             never.
         average_decay: Of the averaged weights that are tested and act, per update; 0: the last ones.
+        win_stay: After so many rollouts in a row that reached their goal nothing is learned, and what acts stays, until
+            one does not (win-stay, lose-shift: Robbins, Bull. AMS 1952); 0: every rollout is learned from.
         terminal: What plans end in, as `WorldModel` has it.
         policy_share: Of the way from the pretrained policy prior to the fine-tuned one that acts.
         simulated_episodes: Of the pretrained policy in the randomised simulator, exploring as in pretraining; half of
@@ -57,6 +59,7 @@ class AbstractMethod(ABC):
     suspicion_margin: float = 0.0
     average_decay: float = 0.0
     policy_share: float = 1.0
+    win_stay: int = 0
     terminal: str = "value"
     simulated_episodes: int = 0
 

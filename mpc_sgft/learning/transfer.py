@@ -167,6 +167,8 @@ class Transfer:
     ) -> dict[str, float]:
         """Judge a rollout [T], learn from all there are, and hand over the parts that may act; returns metrics.
 
+        Where the method stays with what wins, and the last rollouts all did, the rollout is kept and no more happens.
+
         Args:
             steps: The rollout, of one `episode`.
             track: Shows how far the gradient steps are, as tqdm does.
@@ -175,12 +177,20 @@ class Transfer:
         verdict = self.judge(steps, success=success)
         self.buffer.extend(steps)
         self.starts.append(steps["observation"][0].to(self.agent.device))
+        if self.stays:
+            return verdict.metrics()
         starts, metrics = torch.stack(self.starts), dict[str, float]()
         for _ in track(range(self.method.updates)):
             metrics = self.method.update(self.agent, self.batch(), starts=starts)
             self.averaged.follow(self.agent.model)
         self._hand_over(verdict)
         return metrics | verdict.metrics()
+
+    @property
+    def stays(self) -> bool:
+        """Whether the last rollouts all reached their goal, so that nothing is learned until one does not."""
+        last = self.method.win_stay
+        return last > 0 and [v.success for v in self.verdicts[-last:]] == [True] * last
 
     def correct(self, episode: int, success: bool) -> None:
         """Let a rollout, if it was learned from, have reached its goal or not; what acts now stays."""

@@ -56,7 +56,7 @@ class SGFT(AbstractMethod):
             they lower the error on unseen rollouts that failed to this share; 0: never. Other physics can look a little
             like it, so this is less than the gate's.
         gate, gate_margin, gate_memory, gate_excess: Whether there is a gate, and its numbers (`Gate`).
-        updates, slice_len, action_noise, average_decay, policy_share: As in `AbstractMethod`.
+        updates, slice_len, action_noise, average_decay, policy_share, win_stay: As in `AbstractMethod`.
 
     Raises:
         ValueError: If the horizon is not positive, rho lies outside (0, 1], gate_excess is negative, or
@@ -87,6 +87,7 @@ class SGFT(AbstractMethod):
         lr_decay: float,
         average_decay: float,
         policy_share: float,
+        win_stay: int,
         gate: bool,
         gate_margin: float,
         gate_memory: int,
@@ -109,6 +110,7 @@ class SGFT(AbstractMethod):
         self.observation_map, self.observation_lr, self.start_weight = observation_map, observation_lr, start_weight
         self.suspicion_margin = suspicion_margin if observation_map else 0.0
         self.lr_decay, self.average_decay, self.policy_share = lr_decay, average_decay, policy_share
+        self.win_stay = win_stay
         self._pretrained: list[Tensor] = []  # of the dynamics, where the anchor holds them
         self._simulated: Dynamics | None = None  # as they were pretrained, with the command map of those that train
         self._banded: Dynamics | None = None  # the same with the map that has a dead band

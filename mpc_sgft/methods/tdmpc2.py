@@ -23,7 +23,7 @@ class TDMPC2(AbstractMethod):
         command_map: Also learn what the machine makes of a command, together with the dynamics and by the same loss.
         command_lr: Of Adam for it.
         gate, gate_margin, gate_memory: Whether there is a gate, and its numbers (`Gate`).
-        updates, slice_len, action_noise, average_decay, policy_share: As in `AbstractMethod`.
+        updates, slice_len, action_noise, average_decay, policy_share, win_stay: As in `AbstractMethod`.
 
     Source: Hansen, Su, Wang, arXiv:2310.16828.
     """
@@ -41,6 +41,7 @@ class TDMPC2(AbstractMethod):
         gate_memory: int,
         average_decay: float,
         policy_share: float,
+        win_stay: int,
         updates: int,
         slice_len: int,
         action_noise: float,
@@ -50,7 +51,7 @@ class TDMPC2(AbstractMethod):
         self.terminal = terminal
         self.lr, self.lr_decay, self.command_map, self.command_lr = lr, lr_decay, command_map, command_lr
         self.gate = Gate(gate_margin, gate_memory) if gate else None
-        self.average_decay, self.policy_share = average_decay, policy_share
+        self.average_decay, self.policy_share, self.win_stay = average_decay, policy_share, win_stay
         self.updates, self.slice_len, self.action_noise = updates, slice_len, action_noise
 
     def take_over(self, agent: Agent, sensed: Sensed) -> None:

@@ -168,7 +168,7 @@ class Deployment:
             self.operator.enter("training", number)
             with self.watch("learn"):
                 metrics |= self.transfer.learn(valid, self.operator.track, success=rollout.success)
-            self.state["updates"] += self.transfer.method.updates
+            self.state["updates"] += 0 if self.transfer.stays else self.transfer.method.updates
         self.state["rollouts"] = number
         self.state["aborted"] += rollout.aborted is not None
         self.state["interventions"] += rollout.intervened

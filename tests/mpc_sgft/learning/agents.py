@@ -43,6 +43,7 @@ OURS |= dict(
     lr_decay=0.0,
     average_decay=0.0,
     policy_share=1.0,
+    win_stay=0,
 )
 SENSED = Sensed(("tip_x", "tip_y", "height"), torch.zeros(2, 3))
 SGFT_NUMBERS = dict(
@@ -51,7 +52,7 @@ SGFT_NUMBERS = dict(
 TDMPC2_NUMBERS = dict(
     lr=None, lr_decay=0.0, terminal="value", command_map=False, command_lr=2e-2, average_decay=0.0, policy_share=1.0
 )
-TDMPC2_NUMBERS |= dict(updates=1, **SHARED, **NO_GATE)
+TDMPC2_NUMBERS |= dict(updates=1, win_stay=0, **SHARED, **NO_GATE)
 
 
 def hand_over(agent: Agent, name: str = "sgft", rollouts: int = 1, **changes):

@@ -1,5 +1,6 @@
 """The gate between what trains and what acts, and the command map that a few rollouts can teach."""
 
+import copy
 import math
 from pathlib import Path
 
@@ -40,6 +41,7 @@ def make_sgft(**changes) -> SGFT:
         "lr_decay": 0.0,
         "average_decay": 0.0,
         "policy_share": 1.0,
+        "win_stay": 0,
         "slice_len": 2,
     }
     numbers = OmegaConf.load(CONFIGS / "method/sgft.yaml")
@@ -289,6 +291,18 @@ def test_what_acts_is_the_average_of_the_last_updates_with_a_share_of_the_policy
         wanted = before + share * (average - before) if name.startswith("policy_head.") else average
         assert torch.allclose(acts, wanted, atol=1e-6), name
     assert not same(t.acting, t.averaged.model)
+
+
+def test_who_wins_stays_until_a_rollout_fails():
+    t = transfer(gate=False, of_method={"win_stay": 2})
+    for success, learns in ((True, True), (False, True), (True, True), (True, False), (True, False), (False, True)):
+        acting, trained = copy.deepcopy(t.acting), copy.deepcopy(t.agent.model)
+        metrics = t.learn(rollout(t.pretrained, seed=len(t.verdicts)), success=success)
+        assert (not same(t.acting, acting), not same(t.agent.model, trained)) == (learns, learns), len(t.verdicts)
+        assert ("grad_norm" in metrics) is learns and "error_fine_tuned" in metrics and t.stays is not learns
+    assert len(t.buffer) == 6 * 12 and len(t.starts) == len(t.verdicts) == 6  # what was not learned from is kept
+    t.correct(episode=4, success=False)  # a person says so later
+    assert not t.stays
 
 
 def test_a_saved_transfer_goes_on_with_the_same_numbers():

@@ -21,6 +21,7 @@ from mpc_sgft import deploy, evaluate, pretrain
 from mpc_sgft.command.errors import UserError
 from mpc_sgft.learning.transfer import Transfer
 from mpc_sgft.runs import evaluate as evaluating
+from mpc_sgft.runs.real_rollout import drive
 from mpc_sgft.storage import checkpoint
 from mpc_sgft.storage.episode_file import read_episode
 from mpc_sgft.views.deploy_view import DeployViewer
@@ -260,6 +261,15 @@ def test_a_rollout_is_drawn_once_although_the_process_died_learning_from_it(pret
     assert all((before[k] == x).all() for k, x in began.items()) and not all(
         (after[k] == x).all() for k, x in began.items()
     )
+
+
+def test_updates_are_counted_where_something_is_learned(pretrained, tmp_path, monkeypatch):
+    monkeypatch.setattr("mpc_sgft.runs.deploy.drive", lambda *a, **k: drive(*a, **k)._replace(success=True))
+    words = ["gap=pendulum_torque", "rollouts=4", "method.updates=2", "method.win_stay=3"]
+    done = here("deploy", f"checkpoint={pretrained}", f"run_dir={tmp_path / 'run'}", *words)
+    assert json.loads(done.stdout.splitlines()[-1])["updates"] == 4, "of the first two rollouts"
+    learned = [row["consistency_loss"] != "" for row in rows(tmp_path / "run") if row["step"] != "0"]
+    assert learned == [True, True, False, False]
 
 
 def test_evaluations_of_different_seeds_share_no_round(pretrained, tmp_path, monkeypatch):
