@@ -7,7 +7,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 STAMP := .venv/.installed
 # Workers of the test run: one a core, 2 to 8. One thread each: the fast suite is many small tensors.
-WORKERS ?= $(shell n=$$(nproc 2> /dev/null || getconf _NPROCESSORS_ONLN); echo $$((n < 2 ? 2 : n > 8 ? 8 : n)))
+WORKERS ?= $(shell n=$$(env -u OMP_NUM_THREADS nproc 2> /dev/null || getconf _NPROCESSORS_ONLN); echo $$((n < 2 ? 2 : n > 8 ? 8 : n)))
 # Which of them: make test TESTS="tests/planners -k mppi"
 TESTS ?=
 BROWSER := chromium

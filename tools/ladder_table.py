@@ -18,6 +18,9 @@ ADDITIONS = {  # of ours, by the setting that turns one off; settings that are o
 }
 
 
+LATER = {"method.win_stay": "win-stay", "planner.neutral": "neutral action"}  # rows of before were all without
+
+
 def rung(row: Row) -> str:
     """What a run of the ladder has of our additions."""
     words = [change.split("=")[0] for change in row["variant"].split()]
@@ -25,7 +28,7 @@ def rung(row: Row) -> str:
         frozen = " and ".join(word.removeprefix("method.") for word in words if word != "method.lr")
         rate = " at TD-MPC2's rate" if "method.lr" in words else ""
         return f"`sgft_paper`{rate}, {frozen} frozen" if frozen else f"`sgft_paper`{rate}, as published"
-    named = [ADDITIONS[word] for word in words if word in ADDITIONS]
+    named = [both[word] for word in words if word in (both := ADDITIONS | LATER)]
     if row["method"] == "tdmpc2":
         rate = " at pretraining's rate" if "method.lr" in words else ""
         rate += " and plans that end in Q" if "method.terminal" in words else ""

@@ -36,7 +36,7 @@ class AbstractMethod(ABC):
     (`override /planner@_global_.planner: NAME`).
 
     Attributes:
-        updates: Gradient steps after each rollout; 0 learns nothing.
+        updates: Gradient steps after each rollout that is learned from; 0 learns nothing.
         slice_len: Consecutive steps of a slice of the replay [T].
         action_noise: Standard deviation of the noise on real actions, action units.
         gate: When fine-tuned parts may act; None: at once.
@@ -45,7 +45,8 @@ class AbstractMethod(ABC):
             never.
         average_decay: Of the averaged weights that are tested and act, per update; 0: the last ones.
         win_stay: After so many rollouts in a row that reached their goal nothing is learned, and what acts stays, until
-            one does not (win-stay, lose-shift: Robbins, Bull. AMS 1952); 0: every rollout is learned from.
+            one does not (win-stay, lose-shift: Robbins, Bull. AMS 1952); 0: every rollout is learned from. One that a
+            person took over, or that ended at once, ends a streak too; those of the warm-up do not count.
         terminal: What plans end in, as `WorldModel` has it.
         policy_share: Of the way from the pretrained policy prior to the fine-tuned one that acts.
         simulated_episodes: Of the pretrained policy in the randomised simulator, exploring as in pretraining; half of
@@ -98,6 +99,12 @@ def check_simulated(episodes: int, least: int) -> None:
     """Raise ValueError if a method is given too few simulated episodes."""
     if episodes < least:
         raise ValueError(f"simulated_episodes={episodes} must be {least} or more.")
+
+
+def check_win_stay(win_stay: int) -> None:
+    """Raise ValueError if the rollouts of a streak are no number of them."""
+    if not isinstance(win_stay, int) or win_stay < 0:
+        raise ValueError(f"win_stay={win_stay} must be 0 or more rollouts.")
 
 
 def check_objective(horizon: int, rho: float) -> None:

@@ -84,8 +84,9 @@ class Transfer:
         self.acting: WorldModel = copy.deepcopy(agent.model)
         self.verdicts: list[Verdict] = []
         self.starts: list[Tensor] = []  # first observation of each rollout
+        self.streak_from = 0  # the verdict with which a streak of wins may begin
 
-    def judge(self, steps: TensorDict, *, success: bool = False) -> Verdict:
+    def judge(self, steps: TensorDict, *, success: bool = False, warm_up: bool = False) -> Verdict:
         """Test the dynamics on a rollout [T] before it is learned from, and decide who acts next; as in `learn`."""
 
         def error(model: WorldModel) -> float:
@@ -93,7 +94,8 @@ class Transfer:
 
         gate, last = self.method.gate, self.verdicts[-1] if self.verdicts else None
         limit = gate.excess * self._error_in_simulation() if gate and gate.excess else 0.0
-        mapped, band, suspicion = self._choose_maps(error, asked=limit > 0, success=success)
+        stays = not warm_up and self._wins(success)
+        mapped, band, suspicion = self._choose_maps(error, asked=limit > 0, success=success, stays=stays)
         verdict = Verdict(
             error(self.pretrained),
             error(self.averaged.model),
@@ -104,17 +106,21 @@ class Transfer:
             success=success,
             episode=int(steps["episode"][0]),
         )
-        if gate and last:
+        if stays and last:
+            verdict = verdict._replace(accepted=last.accepted, beneath=last.beneath)
+        elif gate and last:
             seen = [*self.verdicts[1:], verdict][-gate.memory :]  # at the first rollout all were still the same
             accepted = begins([(v.fine_tuned, v.pretrained) for v in seen], last.accepted, gate.margin)
             errors = [e for v in seen if (e := v.with_maps_of(verdict)) is not None]
             beneath = not limit or statistics.geometric_mean(errors) > limit
             verdict = verdict._replace(accepted=accepted, beneath=beneath)
         self.verdicts.append(verdict)
+        if warm_up:
+            self.interrupt()
         return verdict
 
     def _choose_maps(
-        self, error: Callable[[WorldModel], float], *, asked: bool, success: bool
+        self, error: Callable[[WorldModel], float], *, asked: bool, success: bool, stays: bool
     ) -> tuple[float | None, Choice | None, Choice | None]:
         """What a verdict says of the maps; all models but the one that acts are told which of them act from now on.
 
@@ -123,6 +129,7 @@ class Transfer:
             asked: It is wanted even where there is nothing to choose.
             success: The rollout reached its goal: it tells nothing of a suspicion. A sensor that lies by so much that
                 something is to be gained keeps rollouts from it, while other physics may look like such a sensor.
+            stays: What acts stays, whatever is found.
         """
         has_band, margin = self.agent.model.dynamics.banded is not None, self.method.suspicion_margin
         if not (asked or has_band or margin):
@@ -141,7 +148,7 @@ class Transfer:
                 set_acting(simulator, rival)
                 errors.append(error(simulator))
             choice = Choice(errors[0], errors[1], acts)
-            if self.verdicts and not (by_failures and success):
+            if self.verdicts and not stays and not (by_failures and success):
                 pairs = [(c.rival, c.plain) for c in [*told, choice] if c][-gate.memory :]
                 choice = choice._replace(rival_acts=begins(pairs, acts, margin))
             for model in (simulator, self.agent.model, self.averaged.model):
@@ -163,7 +170,12 @@ class Transfer:
         return self.simulated_error
 
     def learn(
-        self, steps: TensorDict, track: Callable[[range], Iterable[int]] = iter, *, success: bool = False
+        self,
+        steps: TensorDict,
+        track: Callable[[range], Iterable[int]] = iter,
+        *,
+        success: bool = False,
+        warm_up: bool = False,
     ) -> dict[str, float]:
         """Judge a rollout [T], learn from all there are, and hand over the parts that may act; returns metrics.
 
@@ -173,8 +185,9 @@ class Transfer:
             steps: The rollout, of one `episode`.
             track: Shows how far the gradient steps are, as tqdm does.
             success: It reached its goal.
+            warm_up: The simulation policy drove it: that says nothing of what acts.
         """
-        verdict = self.judge(steps, success=success)
+        verdict = self.judge(steps, success=success, warm_up=warm_up)
         self.buffer.extend(steps)
         self.starts.append(steps["observation"][0].to(self.agent.device))
         if self.stays:
@@ -189,8 +202,16 @@ class Transfer:
     @property
     def stays(self) -> bool:
         """Whether the last rollouts all reached their goal, so that nothing is learned until one does not."""
-        last = self.method.win_stay
-        return last > 0 and [v.success for v in self.verdicts[-last:]] == [True] * last
+        return self._wins()
+
+    def _wins(self, *more: bool) -> bool:
+        """Whether the last rollouts all reached their goal, with these after those that were judged."""
+        last, wins = self.method.win_stay, [*(v.success for v in self.verdicts[self.streak_from :]), *more]
+        return last > 0 and wins[-last:] == [True] * last
+
+    def interrupt(self) -> None:
+        """Count wins anew: what was driven last was not learned from, or by others than what acts."""
+        self.streak_from = len(self.verdicts)
 
     def correct(self, episode: int, success: bool) -> None:
         """Let a rollout, if it was learned from, have reached its goal or not; what acts now stays."""
@@ -229,6 +250,7 @@ class Transfer:
             "starts": [x.clone() for x in self.starts],
             "verdicts": [v.state() for v in self.verdicts],
             "simulated_error": self.simulated_error,
+            "streak_from": self.streak_from,
         }
 
     def load_state_dict(self, state: dict) -> None:
@@ -242,7 +264,7 @@ class Transfer:
         self.acting.load_state_dict(state["acting"])
         self.starts = [x.to(self.agent.device) for x in state["starts"]]
         self.verdicts = [Verdict.from_state(v) for v in state["verdicts"]]
-        self.simulated_error = state["simulated_error"]
+        self.simulated_error, self.streak_from = state["simulated_error"], state["streak_from"]
 
 
 def mean_error(model: WorldModel, episodes: TensorDict, horizon: int) -> float:

@@ -11,7 +11,7 @@ from torch import Tensor
 from mpc_sgft.learning.agent import Agent, floats
 from mpc_sgft.learning.dynamics import Dynamics
 from mpc_sgft.learning.fit import Maps, Penalty, Suspicion, fit_dynamics
-from mpc_sgft.learning.method import AbstractMethod, Gate, check_objective
+from mpc_sgft.learning.method import AbstractMethod, Gate, check_objective, check_win_stay
 from mpc_sgft.learning.observation_map import ObservationMap, Sensed
 from mpc_sgft.learning.slices import to_slices
 from mpc_sgft.learning.world_model import WorldModel
@@ -87,7 +87,6 @@ class SGFT(AbstractMethod):
         lr_decay: float,
         average_decay: float,
         policy_share: float,
-        win_stay: int,
         gate: bool,
         gate_margin: float,
         gate_memory: int,
@@ -95,8 +94,10 @@ class SGFT(AbstractMethod):
         updates: int,
         slice_len: int,
         action_noise: float,
+        win_stay: int = 0,  # runs of before have none
     ):
         check_objective(horizon, rho)
+        check_win_stay(win_stay)
         if gate_excess < 0:
             raise ValueError(f"gate_excess={gate_excess} must be 0 or more.")
         if not 0 <= suspicion_margin < 1:

@@ -4,7 +4,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from mpc_sgft.learning.agent import Agent
-from mpc_sgft.learning.method import AbstractMethod, Gate
+from mpc_sgft.learning.method import AbstractMethod, Gate, check_win_stay
 from mpc_sgft.learning.observation_map import Sensed
 from mpc_sgft.learning.optimizers import PRETRAINED
 from mpc_sgft.learning.world_model import TERMINALS
@@ -41,11 +41,12 @@ class TDMPC2(AbstractMethod):
         gate_memory: int,
         average_decay: float,
         policy_share: float,
-        win_stay: int,
         updates: int,
         slice_len: int,
         action_noise: float,
+        win_stay: int = 0,  # runs of before have none
     ):
+        check_win_stay(win_stay)
         if terminal not in TERMINALS:
             raise ValueError(f"terminal={terminal!r}. Available: {', '.join(TERMINALS)}.")
         self.terminal = terminal

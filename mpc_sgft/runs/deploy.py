@@ -158,7 +158,7 @@ class Deployment:
         return self._finish()
 
     def _count(self, rollout: Rollout, number: int, table: GrowingTable | None) -> None:
-        """Measure a rollout, learn from it unless a person had the arm, and save."""
+        """Measure a rollout, learn from it unless a person had the arm or what wins stays, and save."""
         if self.operator.present:
             self.verdicts.remember()
         self.operator.enter("measuring", number)
@@ -167,8 +167,11 @@ class Deployment:
         if len(valid) >= self.transfer.slice_len and not rollout.intervened:
             self.operator.enter("training", number)
             with self.watch("learn"):
-                metrics |= self.transfer.learn(valid, self.operator.track, success=rollout.success)
+                warm_up = number <= self.cfg.warmup
+                metrics |= self.transfer.learn(valid, self.operator.track, success=rollout.success, warm_up=warm_up)
             self.state["updates"] += 0 if self.transfer.stays else self.transfer.method.updates
+        else:
+            self.transfer.interrupt()
         self.state["rollouts"] = number
         self.state["aborted"] += rollout.aborted is not None
         self.state["interventions"] += rollout.intervened

@@ -32,6 +32,9 @@ COLUMNS = ["run", "gap", "settings", "seed", "rollouts", "success", "episodes"]
 def config_of(run: Path, settings: list[str], seed: int) -> DictConfig:
     """The config of a finished run with some values changed.
 
+    What is changed would have driven otherwise, so that wins of the recorded rollouts are none of its own: all are
+    learned from then, whatever `method.win_stay` was, unless that is given.
+
     Raises:
         UserError: If the folder is no simulated deployment's, or a setting is unknown.
     """
@@ -43,8 +46,9 @@ def config_of(run: Path, settings: list[str], seed: int) -> DictConfig:
     if "method" not in cfg:
         raise UserError(f"{run} is no deployment: its config.yaml has no `method`.")
     OmegaConf.set_struct(cfg, True)
+    first = ["method.win_stay=0"] if settings and "win_stay" in cfg.method else []
     try:
-        cfg.merge_with_dotlist([*settings, f"seed={seed}"])
+        cfg.merge_with_dotlist([*first, *settings, f"seed={seed}"])
     except OmegaConfBaseException as err:
         raise UserError(f"--set {' '.join(settings)}: {err.args[0].splitlines()[0]}") from err
     if cfg.backend.name != "sim":

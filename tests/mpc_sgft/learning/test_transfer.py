@@ -305,6 +305,39 @@ def test_who_wins_stays_until_a_rollout_fails():
     assert not t.stays
 
 
+def test_only_what_acts_wins_and_a_broken_streak_begins_anew():
+    t = transfer(gate=False, of_method={"win_stay": 2})
+
+    def stays(**how: bool) -> bool:
+        t.learn(rollout(t.pretrained, seed=len(t.verdicts)), success=True, **how)
+        return t.stays
+
+    assert [stays(warm_up=True) for _ in range(3)] == [False] * 3  # the simulation policy drove
+    assert [stays(), stays()] == [False, True]
+    t.interrupt()  # a person took over
+    again = transfer(gate=False, of_method={"win_stay": 2})
+    again.load_state_dict(t.state_dict())
+    assert not again.stays and [stays(), stays()] == [False, True]
+
+
+def test_nothing_is_decided_while_what_wins_stays(monkeypatch):
+    """Errors are set here: what was learned predicts better until it wins, and worse then."""
+    t, share = transfer(updates=1, margin=0.8, of_method={"win_stay": 2, "gate_memory": 2}), 0.5
+    monkeypatch.setattr(
+        "mpc_sgft.learning.transfer.open_loop_error",
+        lambda model, *_: torch.full((2, 2), 1.0 if model is t.pretrained else share),
+    )
+    for success in (False, False, True):
+        t.learn(rollout(t.pretrained), success=success)
+    share = 3.0
+    for _ in range(3):
+        t.learn(rollout(t.pretrained), success=True)
+        assert t.stays and t.verdicts[-1].accepted and same(t.acting, t.averaged.model)
+    share = 0.3
+    t.learn(rollout(t.pretrained), success=False)
+    assert t.verdicts[-1].accepted and same(t.acting, t.averaged.model), "0.9 of the error in two rollouts"
+
+
 def test_a_saved_transfer_goes_on_with_the_same_numbers():
     once, twice = (transfer(of_method={"average_decay": 0.9, "policy_share": 0.5}) for _ in range(2))
     for t in (once, twice):

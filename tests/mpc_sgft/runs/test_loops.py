@@ -263,13 +263,20 @@ def test_a_rollout_is_drawn_once_although_the_process_died_learning_from_it(pret
     )
 
 
-def test_updates_are_counted_where_something_is_learned(pretrained, tmp_path, monkeypatch):
-    monkeypatch.setattr("mpc_sgft.runs.deploy.drive", lambda *a, **k: drive(*a, **k)._replace(success=True))
-    words = ["gap=pendulum_torque", "rollouts=4", "method.updates=2", "method.win_stay=3"]
+@pytest.mark.parametrize(
+    ("words", "taken_over", "learned"),
+    [([], 0, [True, True, False, False]), ([], 3, [True, True, False, True]), (["warmup=4"], 0, [True] * 4)],
+    ids=["three wins", "one taken over", "wins of the simulation policy"],
+)
+def test_what_wins_stays_and_its_updates_are_counted(words, taken_over, learned, pretrained, tmp_path, monkeypatch):
+    def wins(*args, number: int, **more):
+        return drive(*args, number=number, **more)._replace(success=True, intervened=number == taken_over)
+
+    monkeypatch.setattr("mpc_sgft.runs.deploy.drive", wins)
+    words = ["gap=pendulum_torque", "rollouts=4", "method.updates=2", "method.win_stay=3", *words]
     done = here("deploy", f"checkpoint={pretrained}", f"run_dir={tmp_path / 'run'}", *words)
-    assert json.loads(done.stdout.splitlines()[-1])["updates"] == 4, "of the first two rollouts"
-    learned = [row["consistency_loss"] != "" for row in rows(tmp_path / "run") if row["step"] != "0"]
-    assert learned == [True, True, False, False]
+    assert json.loads(done.stdout.splitlines()[-1])["updates"] == 2 * sum(learned)
+    assert [row["consistency_loss"] != "" for row in rows(tmp_path / "run") if row["step"] != "0"] == learned
 
 
 def test_evaluations_of_different_seeds_share_no_round(pretrained, tmp_path, monkeypatch):
@@ -309,6 +316,7 @@ def test_the_scripted_pendulum_swings_up(tmp_path):
         (["task=push"], "task"),
         (["gap.effects.actuator_gain.gain=99"], "-5"),
         (["gap.effects.actuator_gain.gian=0.5"], "gain"),
+        (["method.win_stay=null"], "win_stay=None must be 0 or more"),
         (["planner.num_elites=100000"], "num_elites"),
         (["model=5M"], "latent_dim"),
         (["train=recurrent_dr"], "train=recurrent_dr begins a policy anew"),
@@ -347,7 +355,10 @@ def test_relearning_a_deployment_as_it_was_gives_what_it_learned(deployed):
 
 
 def test_relearning_takes_other_settings_and_refuses_unknown_ones(deployed, pretrained):
-    assert relearn.config_of(deployed, ["method.updates=7"], seed=1).method.updates == 7
+    changed = relearn.config_of(deployed, ["method.updates=7"], seed=1).method
+    assert changed.updates == 7 and changed.win_stay == 0, "others have won"
+    assert relearn.config_of(deployed, ["method.win_stay=3"], seed=1).method.win_stay == 3
+    assert relearn.config_of(deployed, [], seed=1).method.win_stay == 5
     with pytest.raises(UserError, match="updats"):
         relearn.config_of(deployed, ["method.updats=7"], seed=1)
     with pytest.raises(UserError, match="no deployment"):
