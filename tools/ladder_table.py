@@ -28,7 +28,8 @@ def rung(row: Row) -> str:
         frozen = " and ".join(word.removeprefix("method.") for word in words if word != "method.lr")
         rate = " at TD-MPC2's rate" if "method.lr" in words else ""
         return f"`sgft_paper`{rate}, {frozen} frozen" if frozen else f"`sgft_paper`{rate}, as published"
-    named = [both[word] for word in words if word in (both := ADDITIONS | LATER)]
+    every = ADDITIONS | LATER
+    named = [every[word] for word in words if word in every]
     if row["method"] == "tdmpc2":
         rate = " at pretraining's rate" if "method.lr" in words else ""
         rate += " and plans that end in Q" if "method.terminal" in words else ""

@@ -54,6 +54,8 @@ def test_rungs_are_named_by_what_they_have() -> None:
     assert named("sgft", " ".join(off)) == "the objective alone"
     assert named("sgft", " ".join(w for w in off if "gate" not in w)) == "gate alone"
     assert named("sgft", "method.anchor=0") == "all but anchor"
+    assert named("sgft", "method.win_stay=0") == "all but win-stay"
+    assert named("tdmpc2", "method.win_stay=5") == "`tdmpc2` with win-stay"
     assert named("sgft_paper", "method.encoder=false method.reward=false") == "`sgft_paper`, encoder and reward frozen"
     assert named("tdmpc2", "method.terminal=q") == "`tdmpc2` and plans that end in Q, plain"
     assert named("sgft_paper", "method.lr=3e-4") == "`sgft_paper` at TD-MPC2's rate, as published"
