@@ -151,7 +151,8 @@ class Deployment:
             self.operator.rest()
             self.verdicts.late(number)
             bar.update(self.state["rollouts"] - bar.n)
-            bar.set_postfix(real_success=f"{self.state['successes']}/{self.state['rollouts']}")
+            paused = {"learning": "paused while it wins"} if self.transfer.stays else {}
+            bar.set_postfix(real_success=f"{self.state['successes']}/{self.state['rollouts']}", **paused)
             if self.stop.asked or self.operator.stopping:
                 raise Stopped(self.how_to_go_on())
         bar.close()
@@ -245,7 +246,8 @@ class Deployment:
         """Tell the operator how the session stands."""
         s = self.state
         text = f"{s['successes']} of {s['rollouts']}, {s['aborted']} aborted, {s['interventions']} taken over"
-        self.operator.tell(successes=f"{text}, {s['rerecorded']} driven again")
+        paused = "; learning paused" if self.transfer.stays else ""
+        self.operator.tell(successes=f"{text}, {s['rerecorded']} driven again{paused}")
 
     def make_logger(self, resume_step: int | None) -> MetricLogger:
         """For metrics from here on; rows after `resume_step` are dropped."""
