@@ -152,7 +152,7 @@ class Deployment:
             self.verdicts.late(number)
             bar.update(self.state["rollouts"] - bar.n)
             paused = {"learning": "paused while it wins"} if self.transfer.stays else {}
-            bar.set_postfix(real_success=f"{self.state['successes']}/{self.state['rollouts']}", **paused)
+            bar.set_postfix({"real_success": f"{self.state['successes']}/{self.state['rollouts']}"} | paused)
             if self.stop.asked or self.operator.stopping:
                 raise Stopped(self.how_to_go_on())
         bar.close()
