@@ -151,7 +151,7 @@ class Deployment:
             self.operator.rest()
             self.verdicts.late(number)
             bar.update(self.state["rollouts"] - bar.n)
-            paused = {"learning": "paused while it wins"} if self.transfer.stays else {}
+            paused = {"learning": "paused"} if self.transfer.stays else {}
             bar.set_postfix({"real_success": f"{self.state['successes']}/{self.state['rollouts']}"} | paused)
             if self.stop.asked or self.operator.stopping:
                 raise Stopped(self.how_to_go_on())
