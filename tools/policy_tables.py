@@ -65,7 +65,8 @@ def tasks() -> str:
 
 
 def once() -> str:
-    return curves(read("once/once.csv"), method_in_gap, "gap and method")
+    now, before = (curves(read(f"once/{name}.csv"), method_in_gap, "gap and method") for name in ("once", "once_before"))
+    return f"{now}\n\nBefore `method.win_stay`:\n\n{before}"
 
 
 def benchmark() -> str:
@@ -126,7 +127,8 @@ def outside() -> str:
     earlier = curves(read("outside/band.csv"), way, "gap, command map")
     first = curves(read("outside/sgft.csv"), method_in_gap, "gap and method")
     told = curves(read("outside/failed_only.csv"), method_in_gap, "gap and method")
-    parts = [first, "With two command maps, `offset` with suspicions too:", today]
+    again = curves(read("outside/again.csv"), method_in_gap, "gap and method")
+    parts = [first, "By later settings, before `method.win_stay`:", again, "With two command maps, `offset` with suspicions too:", today]
     parts += ["Suspicions told by rollouts that failed alone:", told, "What led there:", earlier]
     return "\n\n".join(parts)
 

@@ -97,7 +97,7 @@ def headline() -> str:
         shown = [counts[0], counts[len(counts) // 2], counts[-1]]
         what = f"`{runs[0]['gap']}`, {' → '.join(map(str, shown))}"
         rows.append([what, over_rollouts(runs, shown), folder])
-    rows.append(["5 measured once, 0 → 10 → 20", over_rollouts(read("once/once.csv"), (0, 10, 20)), "once"])
+    rows.append(["5 kept aside, 0 → 10 → 20", over_rollouts(read("once/once.csv"), (0, 10, 20)), "once"])
     score = {r["score"]: r for r in read("blind/blind.csv") if r["method"] == "diagnose"}
     top, false = score["single, clear: top 1"], score["no effect: false alarms"]
     rows.append(["diagnose, right name", f"{percent(top['value'])} of {top['of']}", "blind"])
