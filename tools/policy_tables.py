@@ -65,7 +65,9 @@ def tasks() -> str:
 
 
 def once() -> str:
-    now, before = (curves(read(f"once/{name}.csv"), method_in_gap, "gap and method") for name in ("once", "once_before"))
+    now, before = (
+        curves(read(f"once/{name}.csv"), method_in_gap, "gap and method") for name in ("once", "once_before")
+    )
     return f"{now}\n\nBefore `method.win_stay`:\n\n{before}"
 
 
@@ -128,7 +130,8 @@ def outside() -> str:
     first = curves(read("outside/sgft.csv"), method_in_gap, "gap and method")
     told = curves(read("outside/failed_only.csv"), method_in_gap, "gap and method")
     again = curves(read("outside/again.csv"), method_in_gap, "gap and method")
-    parts = [first, "By later settings, before `method.win_stay`:", again, "With two command maps, `offset` with suspicions too:", today]
+    parts = [first, "By later settings, before `method.win_stay`:", again]
+    parts += ["With two command maps, `offset` with suspicions too:", today]
     parts += ["Suspicions told by rollouts that failed alone:", told, "What led there:", earlier]
     return "\n\n".join(parts)
 
