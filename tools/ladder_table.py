@@ -16,8 +16,6 @@ ADDITIONS = {  # of ours, by the setting that turns one off; settings that are o
     "method.entropy_coef": "broad prior",
     "planner.num_elites": "many elites",
 }
-
-
 LATER = {"method.win_stay": "win-stay", "planner.neutral": "neutral action"}  # rows of before were all without
 
 
