@@ -15,7 +15,7 @@ APT := mesa-vulkan-drivers libegl1 libegl-mesa0 libgl1-mesa-dri libosmesa6 libus
 
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: help setup system packages robot demo test-setup test test-all docs check format clean
+.PHONY: help setup system packages robot client demo test-setup test test-all docs check format clean
 
 help: ## List the targets.
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -57,9 +57,11 @@ demo: setup ## Deploy the shipped checkpoint into a hidden gap, in simulation (m
 	@$(BIN)/python -m mpc_sgft.deploy --backend sim +experiment=demo
 
 # What the tests need beside setup, where it can be had here; what cannot is left out and named at the end of the run.
-test-setup: setup system
+test-setup: setup system client
+
+client: setup
 	@[ "$$(uname -s)" != Linux ] || $(MAKE) --no-print-directory robot \
-	  || echo "the robot's client could not be installed: its tests are left out"
+	  || echo "the robot's client could not be installed: its tests are left out, its types unknown"
 
 test: test-setup ## Set up what the tests need, and run the fast ones.
 	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n $(WORKERS) -m "not slow" $(TESTS)
@@ -71,7 +73,7 @@ docs: setup ## Build the documentation into site/ (strict).
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
 	@echo "site/index.html is the documentation"
 
-check: setup ## Formatting, linting, types.
+check: setup client ## Formatting, linting, types.
 	@$(BIN)/ruff format --check .
 	@$(BIN)/ruff check .
 	@$(BIN)/pyright

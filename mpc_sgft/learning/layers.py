@@ -6,15 +6,15 @@ on a GPU the library is used.
 """
 
 import math
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from contextvars import ContextVar
+from collections.abc import Callable, Sequence
 from functools import cache
 from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
+
+from mpc_sgft.learning.products import Linear
 
 _ONE = torch.ones(())
 LOGIT_LIMIT = 80.0  # e^80 is still a finite float32; LayerNorm keeps logits of SimNorm far below
@@ -155,46 +155,6 @@ class Mish(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         return mish(x)
-
-
-class _RoundedProduct(torch.autograd.Function):
-    """x W^T + b with inputs and results of the three products in bfloat16; x, W, b and the slopes are float32."""
-
-    @staticmethod
-    def forward(ctx: Any, x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-        low = x.bfloat16(), weight.bfloat16()
-        ctx.save_for_backward(*low)
-        return F.linear(*low, bias.bfloat16()).float()
-
-    @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, Tensor | None, Tensor | None]:
-        x, weight = ctx.saved_tensors
-        low, (for_x, for_weight, for_bias) = grad.bfloat16().flatten(0, -2), ctx.needs_input_grad
-        return (
-            (low @ weight).float().view(x.shape) if for_x else None,
-            (low.T @ x.flatten(0, -2)).float() if for_weight else None,
-            grad.flatten(0, -2).sum(0) if for_bias else None,
-        )
-
-
-_rounded: ContextVar[bool] = ContextVar("rounded", default=False)
-
-
-@contextmanager
-def products_in(dtype: torch.dtype) -> Iterator[None]:
-    """Within, matrix products of `Linear` run in float32 or bfloat16; parameters and all else stay float32."""
-    token = _rounded.set(dtype == torch.bfloat16)
-    try:
-        yield
-    finally:
-        _rounded.reset(token)
-
-
-class Linear(nn.Linear):
-    """`nn.Linear` that heeds `products_in`."""
-
-    def forward(self, input: Tensor) -> Tensor:
-        return _RoundedProduct.apply(input, self.weight, self.bias) if _rounded.get() else super().forward(input)  # type: ignore[no-any-return]
 
 
 class NormedLinear(nn.Module):

@@ -5,16 +5,16 @@ are worked out together:
 
 - what is the same for all plans, the first product on the latent they start from, is computed once a plan;
 - the first layers of two heads that see the same latent are one product;
-- the products may run in bfloat16, where the processor has it. Inputs and outputs of a product are rounded then;
+- the products may run in bfloat16. Inputs and outputs of a product are rounded then;
   LayerNorm, activations, SimNorm, two-hot decoding, commands and sums stay float32.
 """
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
 from mpc_sgft.learning.dynamics import Dynamics
 from mpc_sgft.learning.layers import NormedLinear, TwoHot, normed_mish, simnorm
+from mpc_sgft.learning.products import linear
 
 
 class Head:
@@ -27,10 +27,10 @@ class Head:
     """
 
     def __init__(self, net: nn.Sequential, code_dim: int, dtype: torch.dtype) -> None:
-        first, *later = map(_linear, net)
+        first, *later = map(_linear_of, net)
         self.on_code = first.weight[:, :code_dim].to(dtype), first.bias.to(dtype)  # [M, D], [M]
         self.on_rest = first.weight[:, code_dim:].T.contiguous()  # [inputs - D, M], float32
-        self.later = [(linear.weight.to(dtype), linear.bias.to(dtype)) for linear in later]
+        self.later = [(layer.weight.to(dtype), layer.bias.to(dtype)) for layer in later]
         norms = [layer.norm for layer in net if isinstance(layer, NormedLinear)]
         self.hidden_norms, self.out_norm = norms[: len(later)], norms[len(later) :]  # the last layer may have none
         self.dtype = dtype
@@ -39,14 +39,14 @@ class Head:
         """The output, [n, out], from the first product, [n, M]."""
         x = first
         for norm, (weight, bias) in zip(self.hidden_norms, self.later, strict=True):
-            x = F.linear(normed_mish(x, norm).to(self.dtype), weight, bias).float()
+            x = linear(normed_mish(x, norm).to(self.dtype), weight, bias).float()
         return self.out_norm[0](x) if self.out_norm else x
 
 
-def _linear(layer: nn.Module) -> nn.Linear:
-    linear = layer.linear if isinstance(layer, NormedLinear) else layer
-    assert isinstance(linear, nn.Linear), layer
-    return linear
+def _linear_of(layer: nn.Module) -> nn.Linear:
+    own = layer.linear if isinstance(layer, NormedLinear) else layer
+    assert isinstance(own, nn.Linear), layer
+    return own
 
 
 class PlanWeights:
@@ -84,7 +84,7 @@ class PlanWeights:
 
     def first_products(self, names: tuple[str, ...], code: Tensor) -> dict[str, Tensor]:
         """First products of some heads on a code [n, D], {head: [n, M]}, float32."""
-        both = F.linear(code.to(self.dtype), *self._first[names])
+        both = linear(code.to(self.dtype), *self._first[names])
         return {name: part.float() for name, part in zip(names, both.chunk(len(names), -1), strict=True)}
 
 

@@ -7,7 +7,7 @@ from typing import Concatenate, ParamSpec, Protocol, TypeVar
 
 import torch
 
-from mpc_sgft.learning.layers import products_in
+from mpc_sgft.learning.products import has_bfloat16, products_in
 from planners.base import PRECISIONS
 
 WIDE = 256  # hidden units from which bfloat16 products save more than rounding costs
@@ -34,19 +34,10 @@ def dtype_of_products(precision: str, width: int, device: torch.device) -> torch
 
 
 @cache
-def has_bfloat16(device: str) -> bool:
-    """Whether products of bfloat16 run in hardware on a device type."""
-    if device == "cuda":
-        return torch.cuda.is_bf16_supported(including_emulation=False)
-    able = torch.cpu.get_capabilities()
-    return any(able.get(name, False) for name in ("avx512_bf16", "amx_bf16", "bf16", "sve_bf16"))
-
-
-@cache
 def _warn_once() -> None:
     warnings.warn(
-        "precision=bfloat16: this processor has no bfloat16 products and takes a detour through float32; they "
-        "take about three times as long. Use precision=auto or float32.",
+        "precision=bfloat16: this processor has no bfloat16 products. Numbers are rounded as if it had, which takes no "
+        "less time than float32. Use precision=auto or float32.",
         stacklevel=3,
     )
 

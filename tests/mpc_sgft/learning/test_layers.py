@@ -7,10 +7,10 @@ import torch
 import torch.nn.functional as F
 from torch.testing import assert_close
 
+from mpc_sgft.learning import products
 from mpc_sgft.learning.layers import (
     BLOCK_ROWS,
     Ensemble,
-    Linear,
     Normalizer,
     SimNorm,
     TwoHot,
@@ -18,11 +18,11 @@ from mpc_sgft.learning.layers import (
     dropout,
     mish,
     mlp,
-    products_in,
     simnorm,
     symexp,
     symlog,
 )
+from mpc_sgft.learning.products import Linear, linear, products_in
 
 
 def test_symlog_and_symexp_are_inverse_odd_and_known():
@@ -82,6 +82,20 @@ def test_rounded_products_and_their_slopes_are_near_the_exact_ones():
         assert near.dtype == torch.float32 and near.shape == slope.shape
         assert (near - slope).norm() < 0.02 * slope.norm()
     assert torch.equal(layer(x), exact)  # only within
+
+
+@pytest.mark.parametrize("with_bias", [True, False])
+def test_products_without_the_hardware_are_those_of_the_library(with_bias: bool, monkeypatch: pytest.MonkeyPatch):
+    """It rounds the same numbers, and sums in float32 too: results differ in the last of 8 bits at most."""
+    x, weight, bias = (torch.randn(shape).bfloat16() for shape in ((200, 96), (48, 96), (48,)))
+    asked = (x, weight, bias if with_bias else None)
+    library = F.linear(*asked)
+    monkeypatch.setattr(products, "has_bfloat16", lambda device: False)
+    own = linear(*asked)
+    assert own.dtype == torch.bfloat16
+    assert_close(own, library, rtol=2**-7, atol=1e-5)
+    assert (own == library).float().mean() > 0.99
+    assert not torch.equal(own.float(), F.linear(*(t if t is None else t.float() for t in asked)))  # it is rounded
 
 
 @pytest.mark.parametrize("grad", [False, True])
