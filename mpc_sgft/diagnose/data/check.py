@@ -64,7 +64,10 @@ def episodes(
     steps = np.diff(time)
     if (steps <= 0).any():
         row = int(np.flatnonzero(steps <= 0)[0]) + 1
-        raise UserError(f"{table.name}: time does not increase at row {row} ({time[row - 1]:g} to {time[row]:g} s).")
+        raise UserError(
+            f"{table.name}: time does not increase at row {row} ({time[row - 1]:g} to {time[row]:g} s). If another "
+            "episode begins there, say so in a column `episode` (0, 1, …), or write it to a file of its own."
+        )
     dt = float(np.median(steps))
     if dt > 0.2:
         raise UserError(f"{table.name}: one sample every {dt:g} s. `time` is in seconds; is this milliseconds?")

@@ -1,14 +1,14 @@
-"""Measured episodes, and the files that hold one each: CSV, Parquet, and MCAP as deploy writes it.
+"""Measured episodes, and the files that hold them: CSV, Parquet, and MCAP as deploy writes it.
 
 Columns: `time` [s], `ctrl/<actuator>`, `qpos/<joint>`, and where measured `qvel/<joint>`, `force/<actuator>`,
 `sensor/<name>`. Positions are rad or m. A command is held until the next sample: ctrl[k]
-acts from time[k] to time[k + 1].
+acts from time[k] to time[k + 1]. A column `episode`, or `episode_index`, says which of several a row belongs to.
 """
 
 from __future__ import annotations
 
 import csv
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -21,6 +21,7 @@ from mpc_sgft.storage.episode_file import read_episode
 Array = NDArray[np.float64]
 Index = NDArray[np.int_]
 MIN_SAMPLES = 50  # fewer cannot fill three windows
+EPISODE = ("episode", "episode_index")
 
 
 class Offer(NamedTuple):
@@ -96,6 +97,28 @@ def read_table(path: Path) -> Table:
         return _read_mcap(path)
     columns = _read_parquet(path) if suffix == ".parquet" else _read_csv(path)
     return Table(path.stem, columns)
+
+
+def by_episode(table: Table) -> list[Table]:
+    """A table for each number in its column of episodes, in the order of their first rows; itself if it has none.
+
+    Raises:
+        UserError: If some rows are of no episode.
+    """
+    name = next((name for name in EPISODE if name in table.columns), None)
+    if name is None:
+        return [table]
+    columns = {key: values for key, values in table.columns.items() if key != name}
+    which = table.columns[name]
+    if not np.isfinite(which).all():
+        row = int(np.flatnonzero(~np.isfinite(which))[0])
+        raise UserError(f"{table.name}: {name} is not a number in row {row}. Say of every row which episode it is of.")
+    numbers, first = np.unique(which, return_index=True)
+    rows = {number: which == number for number in numbers[np.argsort(first)]}
+    return [
+        replace(table, name=f"{table.name}-{number:g}", columns={key: x[mine] for key, x in columns.items()})
+        for number, mine in rows.items()
+    ]
 
 
 def _read_csv(path: Path) -> dict[str, Array]:

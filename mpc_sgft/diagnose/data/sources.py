@@ -13,7 +13,7 @@ from mpc_sgft.command.errors import UserError
 from mpc_sgft.diagnose.data import lerobot, rosbag
 from mpc_sgft.diagnose.data.mapping import Source, mapped
 from mpc_sgft.diagnose.data.matching import Machine, matched
-from mpc_sgft.diagnose.data.measured import Table, read_table
+from mpc_sgft.diagnose.data.measured import Table, by_episode, read_table
 
 SUFFIXES = (".csv", ".parquet", ".mcap", ".db3")
 ALSO = "a ROS 2 bag or a LeRobotDataset"
@@ -49,7 +49,7 @@ def sources(data: Sequence[str | Path]) -> list[Path]:
             inside = sorted(p for p in item.iterdir() if _is_one(p))
             if not inside:
                 raise UserError(
-                    f"{item}: no episodes in this folder. One episode is one {', '.join(SUFFIXES)} file, {ALSO}."
+                    f"{item}: no episodes in this folder. Episodes are {', '.join(SUFFIXES)} files, {ALSO}."
                 )
             found += inside
         elif not item.exists():
@@ -74,7 +74,7 @@ def opened(path: Path) -> Recording:
     if rosbag.is_bag(path):
         bag = rosbag.read_bag(path)
         return Recording(rosbag.describe_bag(bag), lambda used, joints: [rosbag.table_of(bag, used, joints)])
-    return Recording("", lambda used, joints: [read_table(path)])
+    return Recording("", lambda used, joints: by_episode(read_table(path)))
 
 
 def tables(recording: Recording, mapping: Mapping[str, Source], machine: Machine | None) -> list[Table]:

@@ -14,7 +14,7 @@ from mpc_sgft.command.errors import UserError
 from mpc_sgft.diagnose.__main__ import main
 from mpc_sgft.diagnose.data.check import episodes
 from mpc_sgft.diagnose.data.measured import Table, read_table, write_csv
-from mpc_sgft.diagnose.data.sources import sources
+from mpc_sgft.diagnose.data.sources import opened, sources
 from mpc_sgft.diagnose.data.units import Axis
 from mpc_sgft.diagnose.fitting.prepare import split
 from mpc_sgft.diagnose.run import read
@@ -212,6 +212,21 @@ def test_csv_and_parquet_hold_the_same(tmp_path: Path) -> None:
         assert list(read) == list(columns)
         for key, values in columns.items():
             np.testing.assert_allclose(read[key], values, atol=1e-9)
+
+
+def test_a_file_of_several_episodes_is_that_many_files(tmp_path: Path) -> None:
+    columns = _table().columns
+    count = len(columns["time"])
+    both = {name: np.r_[values, 2 * values] for name, values in columns.items()}
+    write_csv(tmp_path / "log.csv", {"episode": np.repeat([7.0, 3.0], count), **both})
+    first, second = (t for t in opened(tmp_path / "log.csv").tables((), ()))
+    assert (first.name, second.name) == ("log-7", "log-3") and list(first.columns) == list(columns)
+    for name, values in columns.items():
+        np.testing.assert_allclose(first.columns[name], values, atol=1e-9)
+        np.testing.assert_allclose(second.columns[name], 2 * values, atol=1e-9)
+    write_csv(tmp_path / "log.csv", {"episode": np.r_[np.zeros(count), np.nan * np.zeros(count)], **both})
+    with pytest.raises(UserError, match=f"log: episode is not a number in row {count}"):
+        opened(tmp_path / "log.csv").tables((), ())
 
 
 @pytest.mark.parametrize("text", ["", "time,ctrl/m\n", "time,ctrl/m\n0,1\n0.1\n", "time\nzero\n", "time,a,a\n0,1,2\n"])
