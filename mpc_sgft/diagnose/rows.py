@@ -17,6 +17,7 @@ from mpc_sgft.diagnose.verdict.relevance import Relevance, by_window, foretold, 
 from mpc_sgft.diagnose.verdict.tolerance import Predict
 from mpc_sgft.diagnose.verdict.verdict import Verdict
 
+AT_REST = 0.1  # of the nominal error over all windows: where less is held out, that says little
 MAX_CANDIDATES = 20
 
 
@@ -176,6 +177,23 @@ def notes_of_split(episodes: int, held: Sequence[int] | Index) -> list[str]:
     if len(held) == 1:
         notes.append("one window only is held out: intervals of what is held out have no width; record longer")
     return notes
+
+
+def notes_of_rest(signal: str, unit: str, errors: Array, held: Sequence[int] | Index) -> list[str]:
+    """What must be said where what is held out hardly shows what the nominal model misses: at the end of a motion, say.
+
+    Args:
+        signal, unit: Of the signal.
+        errors: Mean square error of the nominal model in each window, fitted ones too, [W].
+        held: Windows that are held out.
+    """
+    here, everywhere = (float(np.sqrt(e.mean())) for e in (errors[held], errors))
+    if here >= AT_REST * everywhere:
+        return []
+    return [
+        f"what is held out hardly shows what is missing: the nominal error of {signal} is {here:.3g} {unit} there and "
+        f"{everywhere:.3g} {unit} over all windows; hold out what moves (--held-out EPISODES) or end recordings earlier"
+    ]
 
 
 def reduction(signal: str, unit: str, before: Array, after: Array, rng: np.random.Generator) -> dict[str, Any]:

@@ -31,6 +31,7 @@ from mpc_sgft.diagnose.rows import (
     Shown,
     candidate_rows,
     effect_rows,
+    notes_of_rest,
     notes_of_split,
     reduction,
     trace_rows,
@@ -234,6 +235,10 @@ def assemble(
     measured = replayer.windows.measured
     signals = _signals(setup, nominal, repaired, measured, rng)
     shown = verdict.kind in ("effect", "not_identifiable")
+    if shown:
+        which, unit = signals[0]["signal"], signals[0]["unit"]
+        off = ((nominal - measured) ** 2).mean(1)[:, replayer.signals.index(which)]
+        notes = [*notes, *notes_of_rest(which, unit, off, setup.held)]
     ties = [
         {"effects": e.names, "probability": verdict.probability[e.key], "held_out_error": e.error, "reason": reason}
         for e, reason in verdict.ties

@@ -22,12 +22,17 @@ MOTOR = '<actuator><motor name="m" joint="j"/></actuator>'
 
 @pytest.fixture
 def swings(tmp_path: Path) -> Path:
+    release(tmp_path, DRAG)
+    return tmp_path
+
+
+def release(folder: Path, drag: float) -> None:
     """Releases at rest from three angles, 3 s each."""
     rng, t = np.random.default_rng(3), np.arange(0, 3, 0.005)
     inertia, weight = SPIN + MASS * LENGTH**2, MASS * 9.81 * LENGTH
     for k, angle in enumerate((0.4, 0.8, -0.6)):
         swing = solve_ivp(
-            lambda _, x: (x[1], (-weight * np.sin(x[0]) - DRAG * x[1]) / inertia),
+            lambda _, x: (x[1], (-weight * np.sin(x[0]) - drag * x[1]) / inertia),
             (0, 3),
             (angle, 0.0),
             t_eval=t,
@@ -35,8 +40,7 @@ def swings(tmp_path: Path) -> Path:
             atol=1e-12,
         )
         q = swing.y[0] + 1e-4 * rng.standard_normal(len(t))
-        write_csv(tmp_path / f"release{k}.csv", {"time": t, "qpos/j": q, "ctrl/m": np.zeros(len(t))})
-    return tmp_path
+        write_csv(folder / f"release{k}.csv", {"time": t, "qpos/j": q, "ctrl/m": np.zeros(len(t))})
 
 
 @pytest.mark.parametrize("motor", ["", MOTOR])
@@ -60,6 +64,20 @@ def test_a_free_swing_tells_its_friction(motor: str, swings: Path) -> None:
     found = effect["parameters"]["coefficient"]
     assert found["value"] == pytest.approx(DRAG, rel=0.02) and found["low"] <= DRAG <= found["high"]
     assert report["held_out"]["repaired"] < 0.05 * report["held_out"]["nominal"]
+
+
+def test_where_all_is_still_when_the_held_out_part_begins_the_report_says_so(tmp_path: Path, swings: Path) -> None:
+    folder = tmp_path / "still"
+    folder.mkdir()
+    (swings / "scene.xml").write_text(SCENE.format(MOTOR))
+    release(folder, 2.0)  # near critical damping: the end of each recording is at rest
+    notes = []
+    for recordings in (swings, folder):
+        data = sorted(recordings.glob("*.csv"))
+        report = diagnose(swings / "scene.xml", data, effects=["viscous_friction"]).as_dict()
+        assert [e["name"] for e in report["effects"]] == ["viscous_friction"]
+        notes.append([note for note in report["notes"] if "hardly shows what is missing" in note])
+    assert not notes[0] and len(notes[1]) == 1 and "--held-out" in notes[1][0]
 
 
 def test_without_a_restriction_a_motor_left_alone_is_no_suspect(swings: Path) -> None:
