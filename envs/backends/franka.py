@@ -12,7 +12,7 @@ from envs.backends.base import BackendError, Outcome
 from envs.backends.pace import Pace
 from envs.backends.rig import Rig
 from envs.backends.route import reset_route
-from envs.backends.safety import NotSafe
+from envs.backends.safety import NotSafe, Refused
 from envs.backends.stream import Sample
 from envs.perception.base import Detection
 from envs.task import AbstractTask, Array
@@ -81,23 +81,30 @@ class FrankaBackend:
         self.rng = np.random.default_rng((seed, 0))
 
     def reset(self, sims: NDArray[np.int_]) -> Array:
-        """Recover, go to the safe posture and down to a drawn start, have the object placed; the first observation.
+        """Recover, go to the safe posture, have the object placed, go down to a drawn start; the first observation.
+
+        A fault on the way is one of those in a row that may be recovered from.
 
         Raises:
             BackendError: If the arm cannot get there; it is at rest.
         """
         if not len(sims):
             return np.zeros((0, self._observation.shape[1]))
-        if self.fault:
-            self.rig.recover(self.fault)
-            self.fault = ""
-        self.open()
-        start = self.task.start(self.rng)
-        try:
-            seen = self._go_to(start.qpos[0, :7], self.task.place_of(start.qpos)[0])
-        except (NotSafe, BackendError) as error:
-            self.rig.end()
-            raise BackendError(f"the episode cannot begin: {error}. The arm is at rest.") from error
+        start, seen = self.task.start(self.rng), None
+        while seen is None:
+            if self.fault:
+                self.rig.recover(self.fault)
+                self.fault = ""
+            self.open()
+            try:
+                seen = self._go_to(start.qpos[0, :7], self.task.place_of(start.qpos)[0])
+            except (NotSafe, BackendError) as error:
+                self.rig.end()
+                if self.rig.by_person or not isinstance(error, NotSafe) or isinstance(error, Refused):
+                    raise BackendError(f"the episode cannot begin: {error}. The arm is at rest.") from error
+                self.fault = str(error)
+                self.counters["faults"] += 1
+                log.warning("the arm was stopped on its way to the start: %s; once more", error)
         self.told, self.target = start.qpos[:, :7].copy(), start.target.copy()
         self.steps, self.note, self._rows = 0, "", []
         self._zero = self.rig.clock.now()
@@ -123,10 +130,14 @@ class FrankaBackend:
         try:
             sent = self._move(sent)
             self.rig.clock.wait(self.pace.due, self.rig.stream.stopped)
+            waits = self.rig.waits
             seen = self.rig.sight()
         except (NotSafe, BackendError) as error:
             return self._stop(str(error), sent)
-        self.pace.end()
+        if self.rig.waits == waits:
+            self.pace.end()
+        else:
+            self.pace.start(self.rig.clock.now())  # what the object took is no jitter, and no planning
         self._observation = self._observe(seen)
         self.steps += 1
         if self.steps == self.task.episode_steps:
@@ -208,10 +219,10 @@ class FrankaBackend:
         """By way of the safe posture to a start q [7], the object put at a place [3]; the sight of it."""
         rig = self.rig
         rig.begin()
-        away, down = reset_route(rig.stream.told, q, **self.way)
-        rig.follow(away)
+        rig.follow(reset_route(rig.stream.told, q, **self.way)[0])
         rig.place(place)
-        rig.follow(down)
+        for path in reset_route(rig.stream.told, q, **self.way):  # from where it is now: it may have been pushed
+            rig.follow(path)
         if not rig.dry_run:
             rig.clock.wait(rig.clock.now() + SETTLE, rig.stream.stopped)
             far = float(np.abs(rig.stream.state.q - q).max())

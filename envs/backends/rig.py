@@ -62,7 +62,7 @@ class Rig:
         self._warned = False
         self.asked: Callable[[], str] = lambda: ""  # why a person wants the arm to stop, empty if nobody does
         self.by_person = False  # the last doubt was a person's wish
-        self.seen: Detection | None = None  # last sight that was used
+        self.seen: Detection | None = None  # newest sight
 
     def open(self) -> None:
         """Connect if need be, hold the tool, and stand ready.
@@ -121,12 +121,16 @@ class Rig:
             raise NotSafe(self.stream.doubt)
 
     def place(self, position: Array) -> None:
-        """Have the object put somewhere, [3] m, where anybody can."""
+        """Have the object put somewhere, [3] m, where anybody can; meanwhile the arm rests without a controller."""
         if self._place is not None and not self.dry_run:
+            self.end()
             self._place(position)
+            self.begin()
 
     def sight(self) -> Detection:
         """A sight of the object that is new enough; while there is none, the arm holds and waits a while.
+
+        A picture without the object says nothing: the sight before it counts until it is too old.
 
         Raises:
             NotSafe: If none comes, or the arm was stopped.
@@ -134,10 +138,9 @@ class Rig:
         deadline, waiting = time.monotonic() + self.patience, False
         while True:
             self.check()
-            seen = None if self._perception is None else self._perception.read()
+            seen = self._newest()
             why = unseen(self.gate.limits, None if seen is None else time.monotonic() - seen.time)
             if seen is not None and not why:
-                self.seen = seen
                 return seen
             if time.monotonic() > deadline:
                 raise NotSafe(why)
@@ -150,9 +153,14 @@ class Rig:
 
     def look_on(self) -> tuple[ArmState, Detection | None]:
         """The arm while nothing is sent to it, and the object if it is seen now."""
-        seen = None if self._perception is None else self._perception.read()
+        seen = self._newest()
         lost = unseen(self.gate.limits, None if seen is None else time.monotonic() - seen.time)
         return self.arm.read(), None if lost else seen
+
+    def _newest(self) -> Detection | None:
+        seen = None if self._perception is None else self._perception.read()
+        self.seen = self.seen if seen is None else seen
+        return self.seen
 
     def end(self) -> str:
         """Bring the arm to rest; what the robot said about it, if anything."""

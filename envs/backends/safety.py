@@ -24,6 +24,10 @@ class NotSafe(Exception):
     """A motion that is refused as a whole. The message says why."""
 
 
+class Refused(NotSafe):
+    """A path that is outside the limits: asked for again, it is refused again."""
+
+
 class Step(NamedTuple):
     """What became of requested moves, a row each.
 
@@ -88,18 +92,20 @@ class Gate:
         An arm at rest sags, so the path may begin up to `OUTSIDE` out of the box, as long as it leads straight back in.
 
         Raises:
-            NotSafe: With the first reason, and where.
+            Refused: With the first reason, and where.
         """
         if not np.isfinite(path).all():
-            raise NotSafe("a target of the path is not finite")
+            raise Refused("a target of the path is not finite")
         found = self._forbidden(path[None], None)
         found["workspace box"] &= ~self._returning(path)
         for reason, where in found.items():
             if where.any():
                 at = int(where[0].argmax())
-                raise NotSafe(f"{reason}, after {100 * at // len(path)} % of the path (tip {self.tip(path[at])} m)")
+                where_at = f"{reason}, after {100 * at // len(path)} % of the path (tip {self.tip(path[at])} m)"
+                then = "" if at else ". Guide the tip into backend.limits.low/high, the joints away from their ends"
+                raise Refused(where_at + then)
         if (np.abs(np.diff(path, axis=0)) > self.limits.speed * DQ_MAX * self.sample_dt + 1e-9).any():
-            raise NotSafe("joint speed")
+            raise Refused("joint speed")
         return path
 
     def _returning(self, path: Array) -> NDArray[np.bool_]:

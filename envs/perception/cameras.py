@@ -140,7 +140,7 @@ class Cameras:
         fused = fuse(detections, window=self.window, agree=self.agree)
         contradict = fused is None and any(d is not None for d in detections)
         if contradict and not self._contradict:
-            log.warning("the cameras see the object in places more than %s m apart; calibrate them again", self.agree)
+            log.warning("cameras see the object more than %s m from the mean of all; calibrate them again", self.agree)
         self._contradict = contradict
         return fused
 

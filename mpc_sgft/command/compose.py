@@ -227,8 +227,14 @@ def resume(name: str, folder: str, overrides: Sequence[str], given: Sequence[str
             f"cannot resume {folder}: an earlier version wrote it ({differs[0]}). "
             "Go on with that version; versions.json there names its commit."
         )
+    if OmegaConf.select(cfg, "backend.dry_run", default=False):
+        raise UserError(f"cannot resume {folder}: it was a dry run, in which nothing moves. Start a run.")
+    if "quiet" in cfg:
+        cfg.quiet = False  # for each call anew: without a page there are no keys
     for override in parse(overrides):
         key = override.key_or_group
+        if key == "backend.dry_run" and override.value():
+            raise UserError("--dry-run is a run of its own. Leave --resume out; that run stays as it is.")
         if (
             key in (*choices.groups(), "run_dir", "checkpoint", "seed", "eval_seed")
             or key.startswith(("gap.", *STORED))

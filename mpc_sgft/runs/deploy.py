@@ -1,9 +1,10 @@
 """The deployment loop: drive a real rollout, record it, learn from it, measure, show, save. Nothing real is lost."""
 
 import json
+import sys
 import time
 from collections.abc import Callable
-from contextlib import closing, nullcontext
+from contextlib import closing, nullcontext, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -50,8 +51,16 @@ def deploy(cfg: DictConfig) -> int:
         run = Deployment(cfg, agent, env, None if real else build.make_env(cfg, cfg.eval_episodes), operator)
         try:
             summary = run.loop()
+        except Stopped:
+            raise
+        except KeyboardInterrupt as error:  # a second Ctrl-C
+            raise Stopped(run.how_to_go_on()) from error
+        except SystemExit:  # the program is to end, or its terminal is gone
+            with suppress(OSError):
+                print(f"\n{run.how_to_go_on()}", file=sys.stderr)
+            raise
         except BackendError as error:
-            if operator.stopping:
+            if operator.stopping or run.stop.asked:
                 raise Stopped(run.how_to_go_on()) from error
             raise UserError(f"{error} {run.how_to_go_on()}") from error
         except OSError as error:  # closing the backend, on the way out, brings the arm to rest
@@ -116,6 +125,7 @@ class Deployment:
         self.metrics: dict[str, float] = {}  # of the last rollout
         self.verdicts = Verdicts(self, ask=person.asks(cfg))
         self.stop = StopRequest("rollout")
+        self.operator.heed(lambda: self.stop.asked)
         self.viewer = (
             DeployViewer(self.folder / "run.rrd", env, megabytes=cfg.log.rerun_mb, resume=bool(cfg.resume))
             if cfg.log.rerun
@@ -195,7 +205,7 @@ class Deployment:
         return self.folder / "episodes" / f"{number:04d}.mcap"
 
     def _rollout(self, number: int) -> Rollout | None:
-        """The next real rollout, or None if the one before is to be driven again first.
+        """The next real rollout, or None if the one before is to be driven again first, or the session ends.
 
         One that a killed process recorded is used as it is, not driven again.
         """
@@ -203,6 +213,7 @@ class Deployment:
         if path.exists():
             episode = read_episode(path)
             if episode.transitions:
+                self.operator.enter("ending", number)  # keys are about it
                 return from_episode(episode, number)
             path.rename(path.with_suffix(".empty.mcap"))  # the robot never moved
         planner = self.planner
@@ -210,6 +221,9 @@ class Deployment:
             planner = self.warm_up
         model = self.transfer.pretrained if number <= cfg.warmup else self.transfer.acting
         seed = start_seed(cfg.seed, number)
+        self.operator.rest()
+        if self.operator.stopping or self.stop.asked:
+            return None
         self.operator.enter("resetting", number - 1)
         try:
             state = begin(self.env, seed)

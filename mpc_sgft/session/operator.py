@@ -1,5 +1,6 @@
 """Who watches a deployment: nobody, or a person at the keyboard (mpc_sgft/session/person.py)."""
 
+import select
 import sys
 import termios
 from collections.abc import Callable, Iterable
@@ -12,6 +13,7 @@ from mpc_sgft.storage.metrics import progress
 from mpc_sgft.storage.rollout import Press
 
 MARKS = {"success": True, "failure": False}
+POLL = 0.02  # [s]
 
 
 class Operator(Protocol):
@@ -39,6 +41,10 @@ class Operator(Protocol):
         """Show what the robot says of itself, in words, as long as the session goes."""
         ...
 
+    def heed(self, ends: Callable[[], bool]) -> None:
+        """From now on questions and pauses end, unanswered, as soon as `ends` says that the session does."""
+        ...
+
     def place(self, position: np.ndarray) -> None:
         """Have the object put somewhere, [3] m in the base frame, and return when it is there.
 
@@ -59,8 +65,8 @@ class Operator(Protocol):
         """Return when the session is not, or not any longer, paused."""
         ...
 
-    def ask(self) -> None:
-        """Return when somebody said whether the episode was a success, or wants something else done with it."""
+    def ask(self) -> bool:
+        """Whether somebody said if the episode was a success, or what else to do with it; False: the session ends."""
         ...
 
     def track(self, steps: range) -> Iterable[int]:
@@ -83,6 +89,7 @@ class Nobody:
 
     def __init__(self, *, quiet: bool = True):
         self.quiet = quiet or not sys.stderr.isatty()
+        self._ends: Callable[[], bool] = lambda: False
 
     def __enter__(self) -> Self:
         return self
@@ -96,15 +103,20 @@ class Nobody:
     def watch(self, status: Callable[[], dict[str, str]]) -> None:
         pass
 
+    def heed(self, ends: Callable[[], bool]) -> None:
+        self._ends = ends
+
     def place(self, position: np.ndarray) -> None:
         """Nobody watches, but somebody may answer: a line, and Enter."""
         if not sys.stdin.isatty():
             raise BackendError("somebody must put the object in its place, and no terminal is attached to ask them")
         termios.tcflush(sys.stdin.fileno(), termios.TCIFLUSH)  # an Enter from before says nothing of now
-        try:
-            input(f"\n{place_text(position)} ")
-        except EOFError as error:
-            raise BackendError("nobody confirmed that the object is in its place") from error
+        print(f"\n{place_text(position)} ", end="", flush=True)
+        while not select.select([sys.stdin], [], [], POLL)[0]:
+            if self._ends():
+                raise BackendError("the session is to end")
+        if not sys.stdin.readline():
+            raise BackendError("nobody confirmed that the object is in its place")
 
     def enter(self, phase: str, episode: int) -> None:
         pass
@@ -115,8 +127,8 @@ class Nobody:
     def rest(self) -> None:
         pass
 
-    def ask(self) -> None:
-        pass
+    def ask(self) -> bool:
+        return True
 
     def track(self, steps: range) -> Iterable[int]:
         bar = progress(len(steps), desc="training", disable=self.quiet, leave=False)

@@ -12,12 +12,13 @@ from omegaconf import DictConfig
 from envs.backends.base import BackendError
 from mpc_sgft.command.errors import UserError
 from mpc_sgft.session.keyboard import Keyboard, has_terminal
-from mpc_sgft.session.operator import MARKS, Nobody, Operator, place_text
+from mpc_sgft.session.operator import MARKS, POLL, Nobody, Operator, place_text
 from mpc_sgft.session.page import Page
 from mpc_sgft.storage.rollout import Press
 
 KEYS = {" ": "stop", "p": "pause", "s": "success", "f": "failure", "r": "rerecord", "t": "takeover", "\n": "confirm"}
-POLL = 0.02  # [s]
+TOGGLES = ("pause", "takeover")
+REPEATED = 1.0  # [s] within which the same key again is one that is held down: it would undo what it did
 
 
 class Person:
@@ -26,17 +27,20 @@ class Person:
     Args:
         page: Where things are shown.
         fd: Of the terminal.
+        repeated: Seconds since it was heard last within which a key that goes to and fro is not heard again.
     """
 
     present = True
 
-    def __init__(self, page: Page, fd: int = 0):
+    def __init__(self, page: Page, fd: int = 0, *, repeated: float = REPEATED):
         self.page, self._keyboard = page, Keyboard(self.heard, fd)
         self.stopping = self.guiding = self.paused = False
         self._phase, self._episode = "connecting", 0
         self._lock = threading.Lock()
         self._presses: list[Press] = []
         self._answered = threading.Event()  # the question that stands was answered
+        self._ends: Callable[[], bool] = lambda: False
+        self._repeated, self._heard_at = repeated, dict[str, float]()
 
     def __enter__(self) -> Self:
         self._keyboard.__enter__()
@@ -52,10 +56,18 @@ class Person:
     def watch(self, status: Callable[[], dict[str, str]]) -> None:
         self.page.status = status
 
+    def heed(self, ends: Callable[[], bool]) -> None:
+        self._ends = ends
+
     def heard(self, character: str) -> None:
         """Take in a key; "" is a terminal that is gone, which stops the session."""
         word = KEYS.get(character.lower(), "") if character else "stop"
+        now = time.monotonic()
         with self._lock:
+            held = word in TOGGLES and now - self._heard_at.get(word, float("-inf")) < self._repeated
+            self._heard_at[word] = now
+            if held:
+                return
             said = self._take(word)
             if said:
                 self._presses.append(Press(word, time.time(), self._episode))
@@ -83,16 +95,15 @@ class Person:
     def rest(self) -> None:
         if self.paused and not self.stopping:
             self.enter("paused: p goes on", self._episode)
-        while self.paused and not self.stopping:
+        while self.paused and not (self.stopping or self._ends()):
             time.sleep(POLL)
 
-    def ask(self) -> None:
-        self._wait("success? s yes, f no, r drive it again")
+    def ask(self) -> bool:
+        return self._wait("success? s yes, f no, r drive it again")
 
     def place(self, position: np.ndarray) -> None:
-        self._wait(place_text(position))
-        if self.stopping:
-            raise BackendError("the operator pressed stop")
+        if not self._wait(place_text(position)):
+            raise BackendError("the operator pressed stop" if self.stopping else "the session is to end")
 
     def track(self, steps: range) -> Iterable[int]:
         for step in steps:
@@ -103,13 +114,15 @@ class Person:
     def tell(self, **facts: str) -> None:
         self.page.tell(**facts)
 
-    def _wait(self, question: str) -> None:
+    def _wait(self, question: str) -> bool:
+        """Whether a question was answered; else the session ends."""
         before = self._phase
         self._answered.clear()
         self.enter(question, self._episode)
-        while not (self.stopping or self._answered.wait(POLL)):
+        while not (self.stopping or self._ends() or self._answered.wait(POLL)):
             pass
         self.enter(before, self._episode)
+        return self._answered.is_set() and not self.stopping
 
     def _take(self, word: str) -> str:
         """Do what a word asks; what to show, empty if it asks for nothing that can be done now."""
@@ -121,7 +134,10 @@ class Person:
             return "pause before the next episode" if self.paused else "going on"
         if word == "takeover" and (self.guiding or self._phase == "running"):
             self.guiding = not self.guiding
-            return "the arm is yours: t hands it back" if self.guiding else "handed back"
+            if self.guiding:
+                return "the arm is yours: t hands it back"
+            self.paused = True  # whoever hands it back still stands beside it
+            return "handed back: step away, then p lets it move"
         if word == "confirm" and self._phase.startswith("put the object"):
             self._answered.set()
             return "the object is in its place"

@@ -58,12 +58,15 @@ class Verdicts:
         self._before = copy.deepcopy({"loop": run.state, "transfer": run.transfer.state_dict(), "metrics": run.metrics})
 
     def of(self, rollout: Rollout, number: int) -> Rollout | None:
-        """A rollout that does not count yet, with what a person says of it; None if it is to be driven again."""
+        """A rollout that does not count yet, with what a person says of it; None if it does not count now.
+
+        Then it is to be driven again, or nobody said what they were asked, because the session ends.
+        """
         self.late(number - 1)
-        known, heard = list(rollout.keys), self._take(number)
+        known, heard, answered = list(rollout.keys), self._take(number), True
         said = verdict([*known, *heard], number)
         if self.ask and rollout.aborted is None and said is None and not again([*known, *heard], number):
-            self.run.operator.ask()
+            answered = self.run.operator.ask()
             heard += self._take(number)
             said = verdict([*known, *heard], number)
         path = self.run.path(number)
@@ -75,6 +78,8 @@ class Verdicts:
             self.run.save()
             self.run.show_counts()
             return None
+        if not answered:
+            return None  # it is recorded, and asked about when the session goes on
         return rollout if said is None else rollout._replace(success=said)
 
     def again(self, number: int) -> bool:

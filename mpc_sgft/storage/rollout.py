@@ -89,7 +89,7 @@ def from_episode(episode: Episode, number: int) -> Rollout:
     )
     outcome = episode.outcome or {}
     aborted = outcome.get("aborted") if episode.complete else "cut off"
-    success = bool(episode.complete and outcome.get("success", flags["success"][-1]))
+    success = bool(episode.complete and outcome.get("success", flags["success"][-1] and not aborted))
     keys = tuple(Press(row["key"], row["unix"], number) for row in episode.keys)
     intervened = bool(outcome.get("intervened") or episode.guided)
     return Rollout(steps, None, None, None, None, [], success, aborted, keys, intervened)

@@ -27,7 +27,8 @@ def start(cfg: DictConfig, root: Path | str = "runs") -> Path:
     """Make the folder of a new run, or return that of a resumed one.
 
     `cfg.resume` names the folder to go on with. Otherwise it is `cfg.run_dir`, exactly, or <root>/<task>/<time>. A new
-    folder gets config.yaml and versions.json, and `latest` links in <root> and <root>/<task> if it lies inside <root>.
+    folder gets config.yaml and versions.json, and `latest` links in <root> and <root>/<task> if it lies inside <root>
+    and is no dry run.
 
     Args:
         cfg: Config of the run, as cli.py makes it (`chosen.task`, `run_dir`, `resume`).
@@ -52,7 +53,7 @@ def start(cfg: DictConfig, root: Path | str = "runs") -> Path:
         place = folder or cfg.run_dir or root / task
         reason = disk_error(err) or f"{err.filename or place}: {err.strerror}. Choose another place with run_dir=..."
         raise UserError(reason) from err
-    if folder.is_relative_to(root):
+    if folder.is_relative_to(root) and not OmegaConf.select(cfg, "backend.dry_run", default=False):
         for link in (root / "latest", root / task / "latest"):
             _link(link, folder)
     return folder

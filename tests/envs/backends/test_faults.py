@@ -5,6 +5,7 @@ import re
 import resource
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -149,6 +150,29 @@ def test_a_robot_that_disappears_ends_the_session_with_a_line(robot: FrankaBacke
     with pytest.raises(BackendError, match="no robot answers|was lost"):
         robot.reset(np.arange(1))
     stand_in.scene = SimpleNamespace(close=stand_in.scene.close)
+
+
+def test_a_doubt_on_the_way_to_a_start_is_recovered_from(robot: FrankaBackend, stand_in: StandIn) -> None:
+    """The object is hidden when the arm looks for it, by a hand, say. The arm rests while somebody puts it down."""
+    put, place = [], robot.rig._place
+
+    def hide_once(position: np.ndarray) -> None:
+        put.append(robot.rig.running)
+        place(position)
+        stand_in.scene.tell(blind=len(put) == 1)
+
+    robot.rig._place = hide_once
+    robot.reset(np.arange(1))
+    assert put == [None, None] and robot.counters["faults"] == robot.rig.retries.faults == 1
+    assert not robot.send(np.array([[0.0, 0.3]])).invalid[0]
+
+
+def test_a_start_out_of_the_box_is_said_at_once(robot: FrankaBackend) -> None:
+    high = robot.gate.limits.high
+    robot.gate.limits = replace(robot.gate.limits, low=(high[0] - 0.02, *robot.gate.limits.low[1:]))
+    with pytest.raises(BackendError, match="workspace box, after 0 %.*Guide the tip into backend.limits.low/high"):
+        robot.reset(np.arange(1))
+    assert robot.rig.retries.faults == 0 and robot.rig.running is None
 
 
 def test_faults_in_a_row_end_the_session(stand_in: StandIn, on_stand_in) -> None:

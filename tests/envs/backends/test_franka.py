@@ -13,6 +13,7 @@ from envs.backends.base import BackendError
 from envs.backends.franka import FrankaBackend
 from envs.backends.rig import Rig
 from envs.backends.safety import NotSafe
+from envs.perception.base import Detection
 from envs.stand_in.client import StandIn
 from envs.tasks.push import Push
 
@@ -54,6 +55,34 @@ def test_a_move_out_of_the_box_is_cut_and_says_so(stand_in: StandIn, on_stand_in
         assert not out.invalid[0] and robot.gate.tip(robot.rig.stream.told)[1] <= 0.08
     assert robot.note == "limited: workspace box" and out.action_sent[0, 1] < 0.5
     assert robot.report()["limited"] >= 2
+
+
+def seer(robot: FrankaBackend, read: Callable[[], Detection | None]) -> None:
+    robot.rig._perception = SimpleNamespace(read=read, close=lambda: None)  # type: ignore[assignment]
+
+
+def test_a_picture_without_the_object_says_nothing_until_the_last_sight_is_old(robot: FrankaBackend) -> None:
+    first = robot.rig.sight()._replace(time=time.monotonic())
+    answers = [first]
+    seer(robot, lambda: answers.pop() if answers else None)
+    assert robot.rig.sight() is first and robot.rig.sight() is first and robot.rig.waits == 0
+    with pytest.raises(NotSafe, match="last seen"):
+        while True:
+            robot.rig.sight()
+            time.sleep(0.02)
+
+
+def test_waiting_for_the_object_is_no_overrun(robot: FrankaBackend) -> None:
+    seen, lost_until = robot.rig.sight(), time.monotonic() + 0.7
+
+    def read() -> Detection:
+        now = time.monotonic()
+        return seen._replace(time=now if now > lost_until else now - 10)
+
+    seer(robot, read)
+    for _ in range(2):
+        assert not robot.send(RIGHT).invalid[0]
+    assert robot.rig.waits == 1 and robot.pace.overruns == 0 and len(robot.pace.lengths) == 1
 
 
 def test_a_joint_near_its_range_does_not_come_nearer(robot: FrankaBackend) -> None:

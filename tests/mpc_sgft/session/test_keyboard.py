@@ -10,9 +10,12 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from envs.backends.base import BackendError
 from mpc_sgft.session.keyboard import Keyboard, ending_in_order
+from mpc_sgft.session.operator import Nobody
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -77,6 +80,15 @@ def test_a_stop_that_comes_with_an_arrow_is_heard(terminal, keys):
     with Keyboard(heard.append, its):
         os.write(ours, keys)
         assert arrived(heard, 1) == [" "]
+
+
+def test_a_line_that_asks_ends_with_the_session(terminal, monkeypatch):
+    with os.fdopen(os.dup(terminal[1]), "r") as its:
+        monkeypatch.setattr(sys, "stdin", its)
+        nobody = Nobody()
+        nobody.heed(lambda: True)
+        with pytest.raises(BackendError, match="the session is to end"):
+            nobody.place(np.zeros(3))
 
 
 ASKED = """

@@ -83,7 +83,10 @@ def test_a_person_runs_a_session(tmp_path: Path) -> None:
     terminal.wait(lambda: steps(2) >= 2)
     terminal.type("t")
     terminal.wait(lambda: steps(2, "guided") >= 20)
+    time.sleep(1.1)  # sooner it would be the same key, held down
     terminal.type("t")
+    terminal.wait(lambda: "paused: p goes on" in terminal.screen)
+    terminal.type("p")
     terminal.wait(lambda: steps(3) >= 2)
     terminal.type("r")
     terminal.wait(lambda: (tmp_path / "episodes" / "0003.rerecorded1.mcap").exists() and steps(3) >= 2)

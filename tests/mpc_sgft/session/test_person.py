@@ -1,6 +1,7 @@
 """What keys mean, and when; and that only somebody who is there is asked."""
 
 import threading
+import time
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from mpc_sgft.storage.rollout import Press
 
 @pytest.fixture
 def person() -> Person:
-    return Person(Page(title="push sgft", rollouts=5, keys=KEYS))
+    return Person(Page(title="push sgft", rollouts=5, keys=KEYS), repeated=0.0)
 
 
 def words(person: Person) -> list[tuple[str, int]]:
@@ -48,6 +49,40 @@ def test_the_arm_is_taken_over_only_in_an_episode(person):
     person.enter("ending", 2)
     assert not person.guiding  # the episode was over already
     assert words(person) == [("takeover", 2)] * 3
+
+
+def test_a_key_that_is_held_down_does_not_undo_itself():
+    person = Person(Page(title="push sgft", rollouts=5, keys=KEYS), repeated=0.3)
+    person.enter("running", 1)
+    for _ in range(5):  # as a terminal repeats it
+        person.heard("t")
+        time.sleep(0.1)
+    assert person.guiding and words(person) == [("takeover", 1)]
+    time.sleep(0.4)
+    person.heard("t")
+    assert not person.guiding
+
+
+def test_nothing_moves_after_an_arm_was_handed_back_until_a_person_says_so(person):
+    person.enter("running", 1)
+    person.heard("t")
+    assert not person.paused
+    person.heard("t")
+    assert person.paused and "step away" in person.page.lines()["key"]
+    timer = threading.Timer(0.1, person.heard, ["p"])
+    timer.start()
+    person.rest()
+    timer.join()
+    assert not person.paused
+
+
+def test_a_session_that_is_to_end_waits_for_nobody(person):
+    person.heard("p")
+    person.heed(lambda: True)
+    person.rest()
+    assert person.paused and not person.ask()
+    with pytest.raises(BackendError, match="the session is to end"):
+        person.place(np.zeros(3))
 
 
 @pytest.mark.parametrize("key", [" ", ""], ids=["key", "terminal gone"])

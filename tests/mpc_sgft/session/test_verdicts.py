@@ -19,7 +19,7 @@ from mpc_sgft.session.corrections import amend
 from mpc_sgft.session.operator import Nobody
 from mpc_sgft.storage import checkpoint
 from mpc_sgft.storage.episode_file import EpisodeWriter, read_episode
-from mpc_sgft.storage.rollout import Press
+from mpc_sgft.storage.rollout import Press, from_episode
 
 STEPS = 8
 SMALL = [f"task.env.episode_steps={STEPS}", "planner=policy", "method.updates=3", "eval_episodes=2", "quiet=true"]
@@ -35,6 +35,7 @@ class Script:
         self.keys, self.answers, self.presses, self.episode = dict(keys), list(answers or ()), [], 0
         nobody = Nobody()
         self.rest, self.track, self.tell, self.halt = nobody.rest, nobody.track, nobody.tell, nobody.halt
+        self.heed = nobody.heed
 
     def enter(self, phase: str, episode: int) -> None:
         self.episode = episode
@@ -44,8 +45,9 @@ class Script:
         taken, self.presses = self.presses, []
         return taken
 
-    def ask(self) -> None:
+    def ask(self) -> bool:
         self.presses.append(Press(self.answers.pop(0), 1e9, self.episode))
+        return True
 
 
 def run(folder: Path, operator: Script | None, *more: str, judged: bool = True) -> dict:
@@ -215,6 +217,47 @@ def test_a_person_is_asked_after_each_episode(tmp_path):
     assert [row["real_success"] for row in rows(tmp_path / "r", "metrics.csv")] == ["1.0", "0.0"]
     assert learned(tmp_path / "r") == [(1, True), (2, False)]
     assert json.loads((tmp_path / "r" / "summary.json").read_text()) == summary
+
+
+def test_a_question_that_was_not_answered_is_asked_when_the_session_goes_on(tmp_path):
+    class Leaves(Script):
+        def ask(self) -> bool:
+            self.stopping = True
+            return False
+
+    folder = tmp_path / "r"
+    with pytest.raises(Stopped, match="saved after 0 rollouts"):
+        run(folder, Leaves({}), "success=ask", judged=False)
+    assert (folder / "episodes" / "0001.mcap").exists()
+    go_on(folder, Script({}, ["success", "failure"]))
+    assert learned(folder) == [(1, True), (2, False)]
+
+
+def test_a_pause_is_heeded_before_every_reset(tmp_path):
+    class Watched(Script):
+        def __init__(self, keys: dict[tuple[str, int], list[str]]):
+            super().__init__(keys)
+            self.seen: list[str] = []
+            self.rest = lambda: self.seen.append("rest")
+
+        def enter(self, phase: str, episode: int) -> None:
+            super().enter(phase, episode)
+            self.seen.append(phase)
+
+    operator = Watched({("running", 1): ["rerecord"]})
+    run(tmp_path / "r", operator)
+    before = [operator.seen[i - 1] for i, phase in enumerate(operator.seen) if phase == "resetting"]
+    assert before == ["rest"] * 3  # the first, the one driven again, the second
+
+
+def test_an_episode_that_an_end_of_the_program_broke_off_is_no_success(tmp_path):
+    row = {"step": 0, "time": 0.2, "action": [0.0], "action_sent": [0.0], "reward": 0.0, "terminated": False}
+    row |= {"truncated": False, "success": True, "invalid": False, "observation": [0.0], "next_observation": [0.0]}
+    with pytest.raises(SystemExit), EpisodeWriter(tmp_path / "0.mcap", {}) as writer:
+        writer.step(row, None)
+        raise SystemExit(143)
+    rollout = from_episode(read_episode(tmp_path / "0.mcap"), 1)
+    assert rollout.aborted and not rollout.success
 
 
 def test_an_episode_that_was_cut_off_is_amended_with_what_was_lost(plain, tmp_path):
