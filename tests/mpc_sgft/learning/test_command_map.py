@@ -59,6 +59,26 @@ def test_a_turned_gain_is_found_and_the_dynamics_stay(simulated: bool) -> None:
         assert off > 0.1, "both explain the data, and neither is the truth"
 
 
+def test_a_value_is_taught_where_plans_read_it() -> None:
+    """V of a state is that of what the simulator would have called its commands, in its loss as at a plan's end."""
+    agent = make_agent(sizes={"obs_dim": 6 + 2 * A, "memory_dim": 2 * A})
+    model = agent.model
+    with torch.no_grad():
+        model.add_command_map().weight[:, :A] = TRUTH
+    agent.train_only(("dynamics", "dynamics.command", "value_head", "q_ensemble", "policy_head"), lr=3e-3, policy_lr=3e-3, command_lr=0.0)
+    seen: list[torch.Tensor] = []
+    model.value_head.register_forward_pre_hook(lambda _, x: seen.append(x[0].detach()))
+    batch = make_batch()
+    memory = torch.rand(*batch["observation"].shape[:2], 2 * A)
+    for where in (batch, batch["next"]):
+        where["observation"] = torch.cat([where["observation"], memory], -1)
+    agent.update(batch)
+    taught_on = next(x for x in seen if x.shape[:2] == (4, 32))  # [T + 1, B]: where the loss is
+    raw = model.encode(batch["observation"][:, 0])[:, -2 * A :]
+    torch.testing.assert_close(taught_on[0, :, -2 * A :], model.dynamics.realised(raw))
+    assert not torch.allclose(taught_on[0, :, -2 * A :], raw)
+
+
 def test_the_change_is_the_sum_of_absolute_differences() -> None:
     dynamics = make_agent(sizes={"obs_dim": 6 + 2 * A, "memory_dim": 2 * A}).model
     dynamics.add_command_map()
