@@ -52,6 +52,7 @@ def pretrain(cfg: DictConfig) -> int:
         stored = build.load_state(saved)
         state, watch.spent = stored["loop"], stored["spent"]
         agent.load_state_dict(stored["agent"])
+        agent.averaged.value_range = float(agent.scale.value)
         buffer.load_state_dict(stored["buffer"])
         if curriculum is not None:
             curriculum.load_state_dict(stored["curriculum"])
