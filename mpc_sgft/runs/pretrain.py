@@ -88,6 +88,7 @@ def pretrain(cfg: DictConfig) -> int:
         wandb=cfg.log.wandb,
         resume_step=state["transitions"] if cfg.resume is not None else None,
     )
+    run_folder.keep_told(cfg, folder)
     bar = progress(cfg.transitions, initial=state["transitions"], desc="pretrain", disable=cfg.quiet)
     result, began = None, time.monotonic() - state["seconds"]
     order, ahead = plan_round(0), None

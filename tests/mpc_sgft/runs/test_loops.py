@@ -6,6 +6,7 @@ import csv
 import io
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -346,6 +347,18 @@ def test_bad_input_is_one_clear_line(pretrained, tmp_path, capsys, words, says):
     assert deploy.main(["--quiet", *TINY, f"run_dir={tmp_path / 'r'}", *given]) == 2
     err = capsys.readouterr().err
     assert says in err and "Traceback" not in err
+
+
+def test_what_a_resumed_run_refuses_leaves_it_as_it_was(pretrained, deployed, tmp_path):
+    for name, run, wrong in (
+        ("deploy", deployed, "rollouts=1"),
+        ("deploy", deployed, "planner.num_elites=100000"),
+        ("pretrain", pretrained, "collector.workers=99"),
+    ):
+        folder = shutil.copytree(run, tmp_path / wrong)
+        done = here(name, "--resume", str(folder), wrong)
+        assert done.returncode == 2 and wrong.rpartition(".")[2] in done.stderr, done.stderr
+        assert (folder / "config.yaml").read_bytes() == (run / "config.yaml").read_bytes()
 
 
 def test_a_corrupt_checkpoint_is_named(pretrained, tmp_path, capsys):
