@@ -63,7 +63,8 @@ def test_resume_takes_the_saved_config_and_its_folder(loops: Path, capsys) -> No
 
 @pytest.mark.parametrize(
     "change",
-    ["task=pendulum", "seed=1", "gap.effects.payload.mass=1", "run_dir=other", "model.mlp_dim=16", "method.lr=1e-5"],
+    ["task=pendulum", "seed=1", "gap.effects.payload.mass=1", "run_dir=other", "model.mlp_dim=16", "method.lr=1e-5"]
+    + ["method.residual=true", "method.command_band=false", "method.suspicion_margin=0"],
 )
 def test_resume_refuses_to_become_another_run(change: str, loops: Path, capsys) -> None:
     assert cli.run(probe("folder"), ["run_dir=first"]) == 0

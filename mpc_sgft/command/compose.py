@@ -35,6 +35,11 @@ RENAMED = {  # beginnings of overrides that had another name
 FILES = {"gap": "effects", "randomize": "draws"}  # groups that a file may stand for, and the mapping that it must hold
 OPEN = ("gap.effects.", "randomize.draws.")  # mappings that may gain keys on the command line
 STORED = ("model.", "train.replay.", "train.agent.entropy_coef")  # what a checkpoint holds: sizes, what has trained
+TRAINED = {  # which parts of a model train, and on what
+    f"method.{name}"
+    for name in "residual command_map command_band observation_map suspicion_margin".split()
+    + ["encoder", "reward", "simulated_episodes"]
+}
 OPTIMISED = {"lr", "policy_lr", "command_lr", "observation_lr", "encoder_lr_share", "entropy_lr"}  # its optimisers hold
 KINDS: tuple[tuple[type, tuple[type, ...], str], ...] = (  # of a default, and what may stand in its place
     (bool, (bool,), "true or false"),
@@ -239,6 +244,7 @@ def resume(name: str, folder: str, overrides: Sequence[str], given: Sequence[str
             key in (*choices.groups(), "run_dir", "checkpoint", "seed", "eval_seed")
             or key.startswith(("gap.", *STORED))
             or key.rpartition(".")[2] in OPTIMISED
+            or key in TRAINED
             or override.is_delete()
         ):
             raise UserError(f"{key!r} cannot change in a resumed run. Start a new one, or leave it out.")
