@@ -7,7 +7,7 @@ import re
 from collections.abc import Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from hydra import compose as hydra_compose
 from hydra import initialize_config_dir
@@ -236,7 +236,9 @@ def resume(name: str, folder: str, overrides: Sequence[str], given: Sequence[str
         raise UserError(f"cannot resume {folder}: it was a dry run, in which nothing moves. Start a run.")
     if "quiet" in cfg:
         cfg.quiet = False  # for each call anew: without a page there are no keys
-    for override in parse(overrides):
+    parsed, raw = parse(overrides), cast(dict[str, Any], OmegaConf.to_container(today))
+    named = {override.key_or_group for override in parsed}
+    for override in parsed:
         key = override.key_or_group
         if key == "backend.dry_run" and override.value():
             raise UserError("--dry-run is a run of its own. Leave --resume out; that run stays as it is.")
@@ -251,7 +253,10 @@ def resume(name: str, folder: str, overrides: Sequence[str], given: Sequence[str
         if not key.startswith(OPEN):
             _check_key(cfg, key)
         _check_kind(OmegaConf.select(today, key, default=OmegaConf.select(cfg, key)), override)
-        OmegaConf.update(cfg, key, override.value(), force_add=key.startswith(OPEN))
+        before = OmegaConf.select(cfg, key)
+        followers = [other for other in _given_as(raw, key) if OmegaConf.select(cfg, other) == before]
+        for changed in (key, *(other for other in followers if other not in named)):
+            OmegaConf.update(cfg, changed, override.value(), force_add=changed.startswith(OPEN))
     _resolve(cfg)
     check_counts(cfg)
     cfg.resume = cfg.run_dir = str(path)
@@ -348,6 +353,17 @@ def _lacking(today: DictConfig, cfg: DictConfig, before: str = "") -> list[str]:
         elif not OmegaConf.is_missing(today, key) and isinstance(OmegaConf.select(today, key), DictConfig):
             there = cfg[key]
             out += _lacking(today[key], there, f"{before}{key}.") if isinstance(there, DictConfig) else []
+    return out
+
+
+def _given_as(node: Mapping[str, Any], key: str, before: str = "") -> list[str]:
+    """Settings of a composed config that are `${key}`; a saved one holds only what they were."""
+    out = []
+    for name, value in node.items():
+        if isinstance(value, dict):
+            out += _given_as(value, key, f"{before}{name}.")
+        elif value == f"${{{key}}}":
+            out.append(before + name)
     return out
 
 
