@@ -12,7 +12,7 @@ from mpc_sgft.command import cli
 
 def probe(loop: str = "", name: str = "deploy") -> cli.Command:
     """A command whose loop is a function of the module that `loops` writes."""
-    return cli.Command(name=name, loop=f"probe_loop:{loop}", summary="", values={"method": ("sgft", "zero_shot")})
+    return cli.Command(name=name, loop=f"probe_loop:{loop}", summary="")
 
 
 @pytest.fixture

@@ -85,6 +85,13 @@ def test_resume_refuses_to_become_another_run(change: str, loops: Path, capsys) 
     assert "cannot change in a resumed run" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("change", ["device=gpu", "success=aks"])
+def test_resume_refuses_words_that_do_not_exist(change: str, loops: Path, capsys) -> None:
+    assert cli.run(probe("folder"), ["run_dir=first"]) == 0
+    assert cli.run(probe("show"), ["--resume", "first", change]) == 2
+    assert "unknown {} '{}'".format(*change.split("=")) in capsys.readouterr().err
+
+
 def test_resume_refuses_the_run_of_another_command(loops: Path, capsys) -> None:
     assert cli.run(probe("folder"), ["run_dir=first"]) == 0
     assert cli.run(probe("show", name="evaluate"), ["--resume", "first"]) == 2

@@ -108,13 +108,12 @@ def parse(overrides: Sequence[str]) -> list[Override]:
         raise UserError(f"{first_line(err)} Quote values that hold commas, spaces or =: key='\"...\"'.") from err
 
 
-def check(name: str, overrides: Sequence[str], values: Mapping[str, Sequence[str]], sweep: bool) -> None:
+def check(name: str, overrides: Sequence[str], sweep: bool) -> None:
     """Refuse unknown groups, options, keys, and values of another kind, before anything is composed for good.
 
     Args:
         name: Command, the config's file name.
         overrides: Normalised overrides.
-        values: Keys whose value must be one of a few words, {key: words}.
         sweep: Whether several values per key are allowed (-m).
 
     Raises:
@@ -148,9 +147,7 @@ def check(name: str, overrides: Sequence[str], values: Mapping[str, Sequence[str
                 raise UserError(f"{key}: {name} has no {group}. Its groups: {', '.join(groups)}.")
             continue
         _check_key(base, key)
-        for word in _values(override) if key in values else []:
-            if word not in values[key]:
-                raise unknown(key, word, values[key])
+        _check_words(override)
         if not (override.is_delete() or override.is_sweep_override()):
             _check_kind(OmegaConf.select(base, key), override)
 
@@ -204,6 +201,8 @@ def complete(cfg: DictConfig, name: str, chosen: Mapping[str, str | None], given
 def resume(name: str, folder: str, overrides: Sequence[str], given: Sequence[str]) -> DictConfig:
     """The saved config of an earlier run, to go on with exactly; plain numbers may be changed, choices may not.
 
+    What today's config gives as another setting, such as `${planner.horizon}`, and was the same, changes with it.
+
     Args:
         name: Command that is asked to resume.
         folder: Run folder with a config.yaml.
@@ -252,6 +251,7 @@ def resume(name: str, folder: str, overrides: Sequence[str], given: Sequence[str
             raise UserError(f"{key!r} cannot change in a resumed run. Start a new one, or leave it out.")
         if not key.startswith(OPEN):
             _check_key(cfg, key)
+        _check_words(override)
         _check_kind(OmegaConf.select(today, key, default=OmegaConf.select(cfg, key)), override)
         before = OmegaConf.select(cfg, key)
         followers = [other for other in _given_as(raw, key) if OmegaConf.select(cfg, other) == before]
@@ -391,6 +391,13 @@ def _check_key(cfg: Any, key: str) -> None:
             aliases = [] if before else ALIASES
             raise unknown("override" if not before else f"key of {before.rstrip('.')}", part, [*names, *aliases])
         before += part + "."
+
+
+def _check_words(override: Override) -> None:
+    key = override.key_or_group
+    for word in _values(override) if key in choices.WORDS else []:
+        if word not in choices.WORDS[key]:
+            raise unknown(key, word, choices.WORDS[key])
 
 
 def _check_kind(default: Any, override: Override) -> None:
