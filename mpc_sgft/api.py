@@ -24,7 +24,7 @@ def configure(*overrides: str, command: str = "deploy") -> DictConfig:
         UserError: For a name or value that does not exist, with those that do.
     """
     normalised = [compose.normalise(text) for text in compose.spread(overrides)]
-    compose.check(command, normalised, {}, sweep=False)
+    compose.check(command, normalised, sweep=False)
     return compose.compose(command, normalised, list(overrides))
 
 

@@ -16,7 +16,7 @@ COMMAND = cli.Command(
         "rollouts": "real rollouts, every one counted",
         "horizon": "steps the planner looks ahead (planner.horizon)",
     },
-    values={"success": ("task", "ask")},
+    words=("success",),
     flags={
         "--backend": ("sim|franka", "where actions go: MuJoCo with a hidden gap, or the robot"),
         "--robot-ip": ("IP|stand-in", "the robot's address (--backend franka); stand-in: a simulated one"),

@@ -12,7 +12,7 @@ COMMAND = cli.Command(
     loop="mpc_sgft.runs.evaluate:evaluate",
     summary="Evaluate a checkpoint, or a fixed policy, on any task and gap: success with an interval, return, JSON.",
     overrides={"episodes": "how many", "horizon": "steps the planner looks ahead (planner.horizon)"},
-    values={"policy": ("planner", "zero", "random", "scripted")},
+    words=("policy",),
 )
 
 

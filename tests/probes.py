@@ -12,7 +12,7 @@ from mpc_sgft.command import cli
 
 def probe(loop: str = "", name: str = "deploy") -> cli.Command:
     """A command whose loop is a function of the module that `loops` writes."""
-    return cli.Command(name=name, loop=f"probe_loop:{loop}", summary="", values={"method": ("sgft", "zero_shot")})
+    return cli.Command(name=name, loop=f"probe_loop:{loop}", summary="")
 
 
 @pytest.fixture
@@ -23,7 +23,7 @@ def loops(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         "imported = gc.isenabled()\n"
         "from mpc_sgft.storage import run_folder\n"
         "from mpc_sgft.command.errors import Stopped\n"
-        "def folder(cfg):\n    print(run_folder.start(cfg))\n"
+        "def folder(cfg):\n    made = run_folder.start(cfg)\n    run_folder.keep_told(cfg, made)\n    print(made)\n"
         "def show(cfg):\n    print(cfg.seed, cfg.chosen.gap, cfg.planner.horizon)\n"
         "def compose_anew(cfg):\n"
         "    from mpc_sgft.command.compose import compose\n"

@@ -61,14 +61,35 @@ def test_resume_takes_the_saved_config_and_its_folder(loops: Path, capsys) -> No
     assert "cannot be resolved" in capsys.readouterr().err
 
 
+def test_a_resumed_run_changes_what_is_given_as_another_setting_too(loops: Path) -> None:
+    def horizons(folder: str, *words: str) -> tuple[int, int]:
+        cfg = compose.resume("deploy", folder, [compose.normalise(word) for word in words], words)
+        return cfg.planner.horizon, cfg.method.horizon
+
+    assert cli.run(probe("folder"), ["run_dir=first", "horizon=4"]) == 0
+    assert horizons("first", "horizon=8") == (8, 8)
+    assert horizons("first", "method.horizon=4", "horizon=8") == horizons("first", "horizon=8", "method.horizon=4")
+    assert horizons("first", "horizon=8", "method.horizon=4") == (8, 4)
+    assert cli.run(probe("folder"), ["run_dir=own", "horizon=4", "method.horizon=3"]) == 0
+    assert horizons("own", "horizon=8") == (8, 3)
+
+
 @pytest.mark.parametrize(
     "change",
-    ["task=pendulum", "seed=1", "gap.effects.payload.mass=1", "run_dir=other", "model.mlp_dim=16", "method.lr=1e-5"],
+    ["task=pendulum", "seed=1", "gap.effects.payload.mass=1", "run_dir=other", "model.mlp_dim=16", "method.lr=1e-5"]
+    + ["method.residual=true", "method.command_band=false", "method.suspicion_margin=0"],
 )
 def test_resume_refuses_to_become_another_run(change: str, loops: Path, capsys) -> None:
     assert cli.run(probe("folder"), ["run_dir=first"]) == 0
     assert cli.run(probe("show"), ["--resume", "first", change]) == 2
     assert "cannot change in a resumed run" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("change", ["device=gpu", "success=aks"])
+def test_resume_refuses_words_that_do_not_exist(change: str, loops: Path, capsys) -> None:
+    assert cli.run(probe("folder"), ["run_dir=first"]) == 0
+    assert cli.run(probe("show"), ["--resume", "first", change]) == 2
+    assert "unknown {} '{}'".format(*change.split("=")) in capsys.readouterr().err
 
 
 def test_resume_refuses_the_run_of_another_command(loops: Path, capsys) -> None:

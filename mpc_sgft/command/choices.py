@@ -9,6 +9,12 @@ import yaml
 ROOT = Path(__file__).resolve().parents[2]
 CONFIG_DIR = ROOT / "configs"
 EFFECT_DIR = ROOT / "envs" / "effects"
+WORDS = {  # settings beside the groups that take one of a few words
+    "device": ("auto", "cpu", "cuda"),
+    "physics": ("mujoco", "warp"),
+    "policy": ("planner", "zero", "random", "scripted"),
+    "success": ("task", "ask"),
+}
 
 
 def groups() -> dict[str, list[str]]:

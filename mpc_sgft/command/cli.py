@@ -42,7 +42,7 @@ class Command:
         loop: "module:function" imported after parsing; gets the DictConfig, returns an exit code or None.
         summary: What the command does, shown by --help.
         overrides: The overrides scripts rely on besides the groups, {name: help}.
-        values: Overrides that take one of a few words, {name: words}.
+        words: Overrides of this command that take one of a few words (`choices.WORDS`).
         flags: Flags of this command alone, {flag: (metavar, help)}.
         switches: Flags of this command alone that take no value, {flag: help}.
     """
@@ -51,7 +51,7 @@ class Command:
     loop: str
     summary: str
     overrides: Mapping[str, str] = field(default_factory=dict)
-    values: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    words: tuple[str, ...] = ()
     flags: Mapping[str, tuple[str, str]] = field(default_factory=dict)
     switches: Mapping[str, str] = field(default_factory=dict)
 
@@ -100,18 +100,17 @@ def _run(command: Command, flags: argparse.Namespace, given: list[str]) -> int:
 
     from mpc_sgft.command import compose
 
-    values = {"device": ("auto", "cpu", "cuda"), "physics": ("mujoco", "warp"), **command.values}
     given = compose.spread(given)
     overrides = [compose.normalise(text) for text in given]
     if flags.multirun:
         if flags.resume is not None or flags.config:
             raise UserError("-m runs several new runs; --resume and --config belong to one run. Give one or the other.")
-        compose.check(command.name, overrides, values, sweep=True)
+        compose.check(command.name, overrides, sweep=True)
         return _sweep(command, overrides)
     if flags.resume is not None:
         cfg = compose.resume(command.name, flags.resume, overrides, given)
     else:
-        compose.check(command.name, overrides, values, sweep=False)
+        compose.check(command.name, overrides, sweep=False)
         cfg = compose.compose(command.name, overrides, given)
     if flags.config:
         print(OmegaConf.to_yaml(cfg), end="")
@@ -214,7 +213,7 @@ def _parse(command: Command, args: list[str]) -> tuple[argparse.Namespace, list[
 
 def _overrides_help(command: Command) -> str:
     rows = {group: ", ".join(options) for group, options in choices.groups_of(command.name).items() if options}
-    rows |= {key: ", ".join(words) for key, words in command.values.items()} | dict(command.overrides) | COMMON
+    rows |= {key: ", ".join(choices.WORDS[key]) for key in command.words} | dict(command.overrides) | COMMON
     lines = [_row(name, text) for name, text in rows.items()]
     if choices.effects():
         lines += [

@@ -7,7 +7,7 @@ import re
 from collections.abc import Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from hydra import compose as hydra_compose
 from hydra import initialize_config_dir
@@ -35,6 +35,11 @@ RENAMED = {  # beginnings of overrides that had another name
 FILES = {"gap": "effects", "randomize": "draws"}  # groups that a file may stand for, and the mapping that it must hold
 OPEN = ("gap.effects.", "randomize.draws.")  # mappings that may gain keys on the command line
 STORED = ("model.", "train.replay.", "train.agent.entropy_coef")  # what a checkpoint holds: sizes, what has trained
+TRAINED = {  # which parts of a model train, and on what
+    f"method.{name}"
+    for name in "residual command_map command_band observation_map suspicion_margin".split()
+    + ["encoder", "reward", "simulated_episodes"]
+}
 OPTIMISED = {"lr", "policy_lr", "command_lr", "observation_lr", "encoder_lr_share", "entropy_lr"}  # its optimisers hold
 KINDS: tuple[tuple[type, tuple[type, ...], str], ...] = (  # of a default, and what may stand in its place
     (bool, (bool,), "true or false"),
@@ -103,13 +108,12 @@ def parse(overrides: Sequence[str]) -> list[Override]:
         raise UserError(f"{first_line(err)} Quote values that hold commas, spaces or =: key='\"...\"'.") from err
 
 
-def check(name: str, overrides: Sequence[str], values: Mapping[str, Sequence[str]], sweep: bool) -> None:
+def check(name: str, overrides: Sequence[str], sweep: bool) -> None:
     """Refuse unknown groups, options, keys, and values of another kind, before anything is composed for good.
 
     Args:
         name: Command, the config's file name.
         overrides: Normalised overrides.
-        values: Keys whose value must be one of a few words, {key: words}.
         sweep: Whether several values per key are allowed (-m).
 
     Raises:
@@ -143,9 +147,7 @@ def check(name: str, overrides: Sequence[str], values: Mapping[str, Sequence[str
                 raise UserError(f"{key}: {name} has no {group}. Its groups: {', '.join(groups)}.")
             continue
         _check_key(base, key)
-        for word in _values(override) if key in values else []:
-            if word not in values[key]:
-                raise unknown(key, word, values[key])
+        _check_words(override)
         if not (override.is_delete() or override.is_sweep_override()):
             _check_kind(OmegaConf.select(base, key), override)
 
@@ -199,6 +201,8 @@ def complete(cfg: DictConfig, name: str, chosen: Mapping[str, str | None], given
 def resume(name: str, folder: str, overrides: Sequence[str], given: Sequence[str]) -> DictConfig:
     """The saved config of an earlier run, to go on with exactly; plain numbers may be changed, choices may not.
 
+    What today's config gives as another setting, such as `${planner.horizon}`, and was the same, changes with it.
+
     Args:
         name: Command that is asked to resume.
         folder: Run folder with a config.yaml.
@@ -231,7 +235,9 @@ def resume(name: str, folder: str, overrides: Sequence[str], given: Sequence[str
         raise UserError(f"cannot resume {folder}: it was a dry run, in which nothing moves. Start a run.")
     if "quiet" in cfg:
         cfg.quiet = False  # for each call anew: without a page there are no keys
-    for override in parse(overrides):
+    parsed, raw = parse(overrides), cast(dict[str, Any], OmegaConf.to_container(today))
+    named = {override.key_or_group for override in parsed}
+    for override in parsed:
         key = override.key_or_group
         if key == "backend.dry_run" and override.value():
             raise UserError("--dry-run is a run of its own. Leave --resume out; that run stays as it is.")
@@ -239,13 +245,18 @@ def resume(name: str, folder: str, overrides: Sequence[str], given: Sequence[str
             key in (*choices.groups(), "run_dir", "checkpoint", "seed", "eval_seed")
             or key.startswith(("gap.", *STORED))
             or key.rpartition(".")[2] in OPTIMISED
+            or key in TRAINED
             or override.is_delete()
         ):
             raise UserError(f"{key!r} cannot change in a resumed run. Start a new one, or leave it out.")
         if not key.startswith(OPEN):
             _check_key(cfg, key)
+        _check_words(override)
         _check_kind(OmegaConf.select(today, key, default=OmegaConf.select(cfg, key)), override)
-        OmegaConf.update(cfg, key, override.value(), force_add=key.startswith(OPEN))
+        before = OmegaConf.select(cfg, key)
+        followers = [other for other in _given_as(raw, key) if OmegaConf.select(cfg, other) == before]
+        for changed in (key, *(other for other in followers if other not in named)):
+            OmegaConf.update(cfg, changed, override.value(), force_add=changed.startswith(OPEN))
     _resolve(cfg)
     check_counts(cfg)
     cfg.resume = cfg.run_dir = str(path)
@@ -345,6 +356,17 @@ def _lacking(today: DictConfig, cfg: DictConfig, before: str = "") -> list[str]:
     return out
 
 
+def _given_as(node: Mapping[str, Any], key: str, before: str = "") -> list[str]:
+    """Settings of a composed config that are `${key}`; a saved one holds only what they were."""
+    out = []
+    for name, value in node.items():
+        if isinstance(value, dict):
+            out += _given_as(value, key, f"{before}{name}.")
+        elif value == f"${{{key}}}":
+            out.append(before + name)
+    return out
+
+
 def _values(override: Override) -> list[str]:
     """The words an override may take: one, or those of a simple sweep or list; none for null and for ranges."""
     if override.is_delete():
@@ -369,6 +391,13 @@ def _check_key(cfg: Any, key: str) -> None:
             aliases = [] if before else ALIASES
             raise unknown("override" if not before else f"key of {before.rstrip('.')}", part, [*names, *aliases])
         before += part + "."
+
+
+def _check_words(override: Override) -> None:
+    key = override.key_or_group
+    for word in _values(override) if key in choices.WORDS else []:
+        if word not in choices.WORDS[key]:
+            raise unknown(key, word, choices.WORDS[key])
 
 
 def _check_kind(default: Any, override: Override) -> None:

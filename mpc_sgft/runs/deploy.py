@@ -132,6 +132,7 @@ class Deployment:
             else None
         )
         self.began = time.monotonic() - self.state["seconds"]
+        run_folder.keep_told(cfg, self.folder)
 
     def loop(self) -> dict[str, Any]:
         """Run what is left, and write the summary."""

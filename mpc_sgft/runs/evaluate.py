@@ -30,6 +30,7 @@ def evaluate(cfg: DictConfig) -> int:
 
         film = Film(build.make_env(cfg, 1))
     folder = run_folder.start(cfg)
+    run_folder.keep_told(cfg, folder)
     build.prepare_process(cfg)
     rounds, first = cfg.episodes // env.batch_size[0], EVAL_SEED + APART * cfg.seed
     with progress(rounds * env.task.episode_steps, desc="evaluate", disable=cfg.quiet) as bar:

@@ -52,6 +52,7 @@ def pretrain(cfg: DictConfig) -> int:
         stored = build.load_state(saved)
         state, watch.spent = stored["loop"], stored["spent"]
         agent.load_state_dict(stored["agent"])
+        agent.averaged.value_range = float(agent.scale.value)
         buffer.load_state_dict(stored["buffer"])
         if curriculum is not None:
             curriculum.load_state_dict(stored["curriculum"])
@@ -87,6 +88,7 @@ def pretrain(cfg: DictConfig) -> int:
         wandb=cfg.log.wandb,
         resume_step=state["transitions"] if cfg.resume is not None else None,
     )
+    run_folder.keep_told(cfg, folder)
     bar = progress(cfg.transitions, initial=state["transitions"], desc="pretrain", disable=cfg.quiet)
     result, began = None, time.monotonic() - state["seconds"]
     order, ahead = plan_round(0), None

@@ -24,7 +24,7 @@ PACKAGES = "torch torchrl tensordict mujoco gymnasium numpy scipy hydra-core saf
 
 
 def start(cfg: DictConfig, root: Path | str = "runs") -> Path:
-    """Make the folder of a new run, or return that of a resumed one.
+    """Make the folder of a new run, or return that of a resumed one, as it is (`keep_told`).
 
     `cfg.resume` names the folder to go on with. Otherwise it is `cfg.run_dir`, exactly, or <root>/<task>/<time>. A new
     folder gets config.yaml and versions.json, and `latest` links in <root> and <root>/<task> if it lies inside <root>
@@ -41,7 +41,7 @@ def start(cfg: DictConfig, root: Path | str = "runs") -> Path:
         UserError: If the folder already holds something, or cannot be written.
     """
     if cfg.resume is not None:
-        return _resumed(cfg)
+        return Path(cfg.resume).resolve()
     root = Path(root).resolve()
     task = str(cfg.chosen.task)
     folder = None
@@ -59,15 +59,21 @@ def start(cfg: DictConfig, root: Path | str = "runs") -> Path:
     return folder
 
 
-def _resumed(cfg: DictConfig) -> Path:
-    """The folder of a run that goes on; what it is told now goes into its config.yaml, and so holds the next time."""
-    folder = Path(cfg.resume).resolve()
+def keep_told(cfg: DictConfig, folder: Path) -> None:
+    """Write what a resumed run is told now into its config.yaml, so that it holds the next time.
+
+    Call it when all is built and loaded: what is refused until then changes nothing. A new run's file stays.
+
+    Raises:
+        UserError: If it cannot be written.
+    """
+    if cfg.resume is None:
+        return
     told = OmegaConf.to_yaml(OmegaConf.merge(cfg, {"resume": None}), resolve=True)
     try:
         write_whole(folder / "config.yaml", told.encode())
     except OSError as err:
         raise UserError(disk_error(err) or f"{err.filename}: {err.strerror}.") from err
-    return folder
 
 
 def _new_folder(run_dir: str | None, parent: Path) -> Path:

@@ -84,7 +84,7 @@ def main(argv: list[str]) -> int:
         if not (args.resets > 0 <= args.steps and 0 < args.size <= 1):
             raise UserError("--resets must be above 0, --steps 0 or more, --size above 0 and at most 1.")
         overrides = [compose.normalise(text) for text in given]
-        compose.check("deploy", overrides, {}, sweep=False)
+        compose.check("deploy", overrides, sweep=False)
         env = robot.make_env(compose.compose("deploy", overrides, given))
         backend = env.backend
         assert isinstance(backend, FrankaBackend)

@@ -2,7 +2,7 @@
 
 import pytest
 
-from mpc_sgft.api import measure
+from mpc_sgft.api import configure, measure
 from mpc_sgft.command import compose
 from mpc_sgft.command.errors import UserError
 from mpc_sgft.runs import build
@@ -48,3 +48,9 @@ def test_a_simulated_reality_rewards_what_is_observed_where_that_is_asked_for() 
 def test_a_draw_that_is_null_is_left_out() -> None:
     cfg = compose.compose("pretrain", ["task=push", "randomize.draws.mass=null"], [])
     assert set(build.draws_of(cfg)) == set(cfg.randomize.draws) - {"mass"}
+
+
+@pytest.mark.parametrize(("word", "command"), [("device=gpu", "deploy"), ("policy=rndom", "evaluate")])
+def test_a_config_from_python_has_only_words_that_exist(word: str, command: str) -> None:
+    with pytest.raises(UserError, match=f"unknown {word.partition('=')[0]}"):
+        configure(word, command=command)

@@ -6,6 +6,7 @@ import csv
 import io
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -21,6 +22,8 @@ from mpc_sgft import deploy, evaluate, pretrain
 from mpc_sgft.command.errors import UserError
 from mpc_sgft.learning.transfer import Transfer
 from mpc_sgft.runs import evaluate as evaluating
+from mpc_sgft.runs import pretrain as pretraining
+from mpc_sgft.runs.collect import planner_policy
 from mpc_sgft.runs.real_rollout import drive
 from mpc_sgft.storage import checkpoint
 from mpc_sgft.storage.episode_file import read_episode
@@ -96,6 +99,22 @@ def test_pretraining_resumes_with_the_same_numbers(pretrained, tmp_path):
     assert run("pretrain", "--resume", str(half), "transitions=2400").returncode == 0
     model = checkpoint.load(half / "checkpoint" / "model.safetensors").model
     assert model.value_range == pytest.approx(float(rows(half)[-1]["scale"])) and model.value_range > 1.1
+
+
+def test_a_final_evaluation_that_was_left_plans_with_the_range_of_what_was_learned(tmp_path, monkeypatch):
+    assert here("pretrain", f"run_dir={tmp_path / 'r'}", "transitions=320", "collector=inline").returncode == 0
+    saved, ranges = tmp_path / "r" / "checkpoint" / "state.pt", []
+    state = checkpoint.load_state(saved)
+    state["agent"]["snapshot"]["scale"] = torch.tensor(3.0)
+    checkpoint.save_state(saved, state)
+
+    def watched(model, *rest):
+        ranges.append(model.value_range)
+        return planner_policy(model, *rest)
+
+    monkeypatch.setattr(pretraining, "planner_policy", watched)
+    assert here("pretrain", "--resume", str(tmp_path / "r")).returncode == 0
+    assert ranges == [3.0, 3.0]
 
 
 def test_a_run_that_held_its_target_goes_on_only_when_told_to(tmp_path):
@@ -328,6 +347,18 @@ def test_bad_input_is_one_clear_line(pretrained, tmp_path, capsys, words, says):
     assert deploy.main(["--quiet", *TINY, f"run_dir={tmp_path / 'r'}", *given]) == 2
     err = capsys.readouterr().err
     assert says in err and "Traceback" not in err
+
+
+def test_what_a_resumed_run_refuses_leaves_it_as_it_was(pretrained, deployed, tmp_path):
+    for name, run, wrong in (
+        ("deploy", deployed, "rollouts=1"),
+        ("deploy", deployed, "planner.num_elites=100000"),
+        ("pretrain", pretrained, "collector.workers=99"),
+    ):
+        folder = shutil.copytree(run, tmp_path / wrong)
+        done = here(name, "--resume", str(folder), wrong)
+        assert done.returncode == 2 and wrong.rpartition(".")[2] in done.stderr, done.stderr
+        assert (folder / "config.yaml").read_bytes() == (run / "config.yaml").read_bytes()
 
 
 def test_a_corrupt_checkpoint_is_named(pretrained, tmp_path, capsys):

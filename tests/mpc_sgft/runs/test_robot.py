@@ -13,7 +13,7 @@ from mpc_sgft.storage import checkpoint
 
 def config(*given: str):
     overrides = [compose.normalise(text) for text in ("backend=franka", *given)]
-    compose.check("deploy", overrides, {}, sweep=False)
+    compose.check("deploy", overrides, sweep=False)
     return compose.compose("deploy", overrides, given)
 
 
