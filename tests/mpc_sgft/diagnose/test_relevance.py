@@ -18,6 +18,7 @@ from mpc_sgft.diagnose.__main__ import main
 from mpc_sgft.diagnose.data.measured import Array
 from mpc_sgft.diagnose.fitting.hypothesis import Hypothesis
 from mpc_sgft.diagnose.verdict.relevance import Repairs, repairs
+from mpc_sgft.diagnose.verdict.repair import into
 from mpc_sgft.diagnose.verdict.tolerance import Tolerance, limits_of, parse_tolerance, spread_of
 
 FEW = ["viscous_friction", "coulomb_friction", "quadratic_drag", "actuator_offset"]
@@ -106,6 +107,21 @@ def test_a_repair_that_does_not_repair_is_not_written(slide: Path, record: Recor
     assert report["effects_file"] is None and not (tmp_path / "out" / "repaired.xml").exists()
     told = f"errors on the {report['held_out']['windows']} windows that were never fitted do not credibly fall"
     assert any("no repaired.xml" in n and told in n for n in report["notes"]), report["notes"]
+
+
+def test_a_repair_that_does_not_load_is_a_note(tmp_path: Path) -> None:
+    held = SimpleNamespace(names=["a"], fit=SimpleNamespace(terms=[object()]))
+    row = {"signal": "qpos/x", "nominal": 1.0, "repaired": 0.1, "unit": "m"}
+    data: dict[str, Any] = {"held_out": row, "verdict": "effect", "notes": [], "repaired_model": None}
+
+    def write() -> list[str]:
+        (tmp_path / "repaired.xml").write_text("<mujoco>")
+        raise ValueError("Error opening file 'gone.obj'")
+
+    into(tmp_path, data, held, Repairs(True, "all"), write)  # type: ignore[arg-type]
+    assert data["repaired_model"] is None and not list(tmp_path.iterdir())
+    (note,) = data["notes"]
+    assert note.startswith("no repaired.xml: the scene with a in it does not load") and "gone.obj" in note
 
 
 def test_no_repair_that_runs_away_in_the_scenes_own_steps(slide: Path, record: Record, tmp_path: Path) -> None:
