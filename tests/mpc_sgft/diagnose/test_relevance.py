@@ -155,6 +155,14 @@ def test_few_windows_apart_leave_the_word_to_all(
     assert repairs(setup, better, better, base, np.random.default_rng(0)) == Repairs(lowers, on)
 
 
+def test_parts_of_few_windows_are_few_windows() -> None:
+    """Two windows apart, each cut into twelve parts that fall alike, while those that were fitted rise."""
+    setup: Any = SimpleNamespace(fitted=np.arange(15), held=np.arange(2), parts=12, squared=np.expm1)
+    base, better = (judged(np.full(17 * 12, 10.0) - d) for d in (0.0, np.repeat([-9.0, 0.5], [15 * 12, 2 * 12])))
+    told = Repairs(False, "all 17 windows, each foretold by the others")
+    assert repairs(setup, better, better, base, np.random.default_rng(0)) == told
+
+
 def judged(errors: Array) -> Hypothesis:
     return Hypothesis(fit=None, effects=1, errors=errors, fitted=errors, complexity=1)  # type: ignore[arg-type]
 
