@@ -7,6 +7,7 @@ from difflib import get_close_matches
 
 import numpy as np
 from scipy.interpolate import CubicSpline
+from scipy.optimize import isotonic_regression
 
 from mpc_sgft.command.errors import UserError
 from mpc_sgft.diagnose.data.measured import MIN_SAMPLES, Array, Episode, Index, Table
@@ -15,6 +16,9 @@ from mpc_sgft.diagnose.data.units import Axis, check_order, check_speeds, check_
 KINDS = ("qpos", "qvel", "force", "sensor")
 GAP = 3.5  # a pause longer than this many sample times starts a new episode
 JITTER = 0.01  # of a sample time; more is interpolated away
+STRAY = 0.02  # share of stamps that may be off an even clock by more than half a sample
+FOLLOW = 0.05  # of what a stamp is off by which the phase of ticks follows it
+RECOUNTS = 10  # of the ticks, on a clock that was laid through the last count
 
 
 def check_settings(window: float | None, seed: int, max_effects: int) -> None:
@@ -150,26 +154,31 @@ def _even(
 ) -> Episode:
     """One piece on an even clock: positions by cubic interpolation.
 
-    Stamps that scatter around an even clock by less than half a sample are taken for scattered readings of a controller
-    that ticks evenly: the command of a row acts from its tick on, and a force that was read before shows the command
-    before. Otherwise commands act from the row's own time on. Then, and on another clock, nobody knows which of two a
-    force shows.
+    Stamps that scatter around an even clock by less than half a sample, but for a few, are taken for scattered readings
+    of a controller that ticks evenly: the command of a row acts from its tick on, and a force that was read before
+    shows the command before. Otherwise commands act from the row's own time on, and a note says so. Then, on another
+    clock, and where a stamp is off by more, nobody knows which of two a force shows.
     """
     time = columns["time"][rows]
-    ticks = np.concatenate([[0], np.cumsum(np.maximum(1, np.round(np.diff(time) / dt)))])
-    even_dt, first = _line(ticks, time)
-    ticking = bool(np.abs(time - first - even_dt * ticks).max() < 0.5 * even_dt)
-    came = first + even_dt * ticks if ticking and clock is not None else time  # from when on commands act
+    ticks, even_dt, first = _clock(time, dt)
+    strays = float((np.abs(time - first - even_dt * ticks) >= 0.5 * even_dt).mean())
+    ticking = strays <= STRAY
+    if not ticking:
+        notes += (
+            f"{name}: {strays:.0%} of the stamps are off an even clock by more than half a sample: each command acts "
+            "from its row's own time on. Where the controller ticks evenly, record the times of its ticks",
+        )
+    came = first + even_dt * ticks if ticking else time  # from when on commands act
     ticking = ticking and clock is None
     if ticking:
-        even, late = first + even_dt * np.arange(int(ticks[-1]) + 1), even_dt / 2
+        even = first + even_dt * np.arange(ticks[-1] + 1)
     else:
-        even_dt, late = clock or dt, 1e-9
+        even_dt = clock or dt
         even = came[0] + even_dt * np.arange(int((came[-1] - came[0]) / even_dt + 1e-6) + 1)
     jitter = len(even) != len(time) or bool(np.abs(time - even).max() > JITTER * dt)
-    held = np.clip(np.searchsorted(came, even + late, side="right") - 1, 0, len(time) - 1)
+    held = np.clip(np.searchsorted(came, even + 1e-9, side="right") - 1, 0, len(time) - 1)
     off = time[held] - even
-    own = np.abs(off) < late  # ticks with a row of their own
+    own = np.abs(off) < even_dt / 2  # ticks with a row of their own
     off_tick = np.where(own & ticking, np.where(np.abs(off) > JITTER * dt, off, 0.0), np.nan)
 
     def smooth(name: str) -> Array:
@@ -182,6 +191,31 @@ def _even(
     wanted = [n for n in columns if n.split("/")[0] in KINDS]
     wanted = [n for n in wanted if not n.startswith("qpos/") or n.split("/", 1)[1] in joints]
     return Episode(name, even_dt, ctrl, {n: smooth(n) for n in wanted}, notes, off_tick if jitter else 0.0)
+
+
+def _clock(time: Array, dt: float) -> tuple[Index, float, float]:
+    """The tick of each row of [T], from 0 on, and the even clock's sample time [s] and start [s].
+
+    Steps that are rounded one by one do not add up, so that a phase is carried along. It and dt, which is not quite
+    known, follow the stamps slowly. Then each row gets the nearest tick of the clock, and each another: a stamp that is
+    nearest to the tick of its neighbour gets the free one beside it.
+    """
+    at, tick, ticks, row = float(time[0]), 0, np.zeros(len(time), int), np.arange(len(time))
+    for i, t in enumerate(time.tolist()):
+        n = round((t - at) / dt)
+        at += n * dt
+        late = t - at
+        at += FOLLOW * late
+        dt += FOLLOW**2 / 2 * late
+        tick = ticks[i] = tick + n
+    for _ in range(RECOUNTS):
+        even_dt, first = _line(ticks, time)
+        counted, ticks = ticks, row + np.round(isotonic_regression((time - first) / even_dt - row).x).astype(int)
+        first += even_dt * ticks[0]
+        ticks -= ticks[0]
+        if (ticks == counted).all():
+            break
+    return ticks, even_dt, first
 
 
 def _line(x: Array, y: Array) -> tuple[float, float]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -196,7 +197,7 @@ def load_plant(model: str | Path | mujoco.MjModel | mujoco.MjSpec) -> Plant:
         UserError: If the file is absent or does not load, or the scene cannot be diagnosed.
     """
     if isinstance(model, mujoco.MjSpec):
-        return Plant(model)
+        return Plant(_rooted(model.copy(), [Path(model.modelfiledir)]))
     try:
         if isinstance(model, mujoco.MjModel):
             return Plant(_decompile(model))
@@ -206,12 +207,39 @@ def load_plant(model: str | Path | mujoco.MjModel | mujoco.MjSpec) -> Plant:
         if is_urdf(path):
             found = read_urdf(path)
             return Plant(found.spec, found.notes, bare=True, said=found.driven)
-        spec = mujoco.MjSpec.from_file(str(path))
-        for kind in ("meshdir", "texturedir"):  # so that a repaired scene elsewhere finds its files
-            setattr(spec, kind, str((path.parent / (getattr(spec, kind) or "")).resolve()))
-        return Plant(spec)
+        return Plant(_rooted(mujoco.MjSpec.from_file(str(path)), _folders(path)))
     except ValueError as error:
         raise UserError(f"{model}: MuJoCo cannot load this scene: {error}") from error
+
+
+def _rooted(spec: mujoco.MjSpec, folders: Sequence[Path]) -> mujoco.MjSpec:
+    """The scene with absolute names of its files, so that a repaired one elsewhere finds them.
+
+    Args:
+        spec: Is changed.
+        folders: Of the models that it is made of. MuJoCo does not tell of which one a file is: a name stays as it is
+            where it is in none of them, or in several.
+    """
+
+    def find(folder: str, name: str) -> str:
+        name = Path(name).name if spec.strippath else name
+        there = {str((f / folder / name).resolve()) for f in folders if name and (f / folder / name).is_file()}
+        return there.pop() if len(there) == 1 else name
+
+    for element in (*spec.meshes, *spec.hfields, *spec.skins):
+        element.file = find(element.compiler.meshdir, element.file)
+    for texture in spec.textures:
+        texture.file = find(texture.compiler.texturedir, texture.file)
+        texture.cubefiles = [find(texture.compiler.texturedir, name) for name in texture.cubefiles]
+    spec.strippath = False
+    return spec
+
+
+def _folders(path: Path) -> list[Path]:
+    """The folder of an MJCF file, and those of the models that it attaches."""
+    attached = re.findall(r"""<model\s[^>]*?file\s*=\s*["']([^"']+)""", path.read_text(errors="replace"))
+    files = [path.parent / name for name in attached]
+    return [path.parent, *(folder for file in files if file.is_file() for folder in _folders(file))]
 
 
 def driven(plant: Plant, tables: Sequence[Table]) -> Plant:

@@ -123,7 +123,7 @@ def repairs(
     apart = f"the {len(setup.held)} windows that were never fitted"
     if after >= before:
         return Repairs(False, apart)
-    if len(told) < judge.FEW:
+    if len(setup.held) < judge.FEW:
         first, apart = 0, f"all {len(setup.fitted) + len(setup.held)} windows, each foretold by the others"
     return Repairs(judge.gain(base.errors[first:], held.errors[first:], 0.90, rng).low > 0, apart)
 

@@ -66,7 +66,8 @@ def into(
         data: Of the report.
         held: What the repair holds.
         repairs: Whether it credibly lowers errors.
-        write_files: Writes repaired.xml and effects.yaml, and returns notes.
+        write_files: Writes repaired.xml and effects.yaml, and returns notes; a ValueError says that what it wrote does
+            not load.
         unstable: Why the scene cannot be simulated with it, if it cannot.
     """
     out.mkdir(parents=True, exist_ok=True)
@@ -85,8 +86,18 @@ def into(
             "More episodes tell more"
         )
         return
+    try:
+        notes = write_files()
+    except ValueError as error:
+        for name in FILES:
+            (out / name).unlink(missing_ok=True)
+        data["notes"].append(
+            f"no repaired.xml: the scene with {what} in it does not load from there ({' '.join(str(error).split())}). "
+            "Give the files of the scene by absolute names, and diagnose again"
+        )
+        return
     data["repaired_model"], data["effects_file"] = FILES
-    data["notes"] += [f"repaired.xml: errors credibly fall on {repairs.on}", *write_files()]
+    data["notes"] += [f"repaired.xml: errors credibly fall on {repairs.on}", *notes]
     if data["verdict"] == "unknown":
         data["notes"].append(
             f"repaired.xml and effects.yaml hold {what}: a fit that takes part of the error away, not its name"

@@ -164,6 +164,22 @@ def test_scattered_stamps_do_not_move_the_commands() -> None:
     np.testing.assert_allclose(episode.signals["qpos/x"], np.sin(ticks), atol=3e-4)  # the stamps are off by up to 2e-3
 
 
+def test_much_scatter_lost_rows_and_a_late_stamp_do_not_move_the_commands() -> None:
+    rng, ticks = np.random.default_rng(1), np.arange(2000)
+    ctrl, there = rng.normal(size=2000), ~np.isin(ticks, [300, 301, 900])
+    scattered, late, early = (ticks + rng.uniform(-x, x, 2000) for x in (0.4, 0.02, 0.02))
+    late[500] += 0.6
+    early[500] -= 0.6
+    for stamps in (scattered, late, early):
+        time = 0.01 * stamps[there]
+        (episode,) = episodes(_table(time=time, ctrl__motor=ctrl[there], qpos__x=np.sin(time)), ["motor"], RANGES)
+        np.testing.assert_array_equal(episode.ctrl[there, 0], ctrl[there])
+        assert not episode.notes
+        near = np.abs(stamps - ticks) < 0.49  # nobody knows what the others show
+        assert np.isfinite(np.broadcast_to(episode.off_tick, 2000)[there & near]).all()
+        assert np.isnan(episode.off_tick[500]) == (stamps is not scattered)
+
+
 def test_a_force_that_was_read_before_its_tick_shows_the_command_before() -> None:
     rng, ticks = np.random.default_rng(0), np.arange(2000) * 0.01
     late = rng.choice([-0.0002, 0.0, 0.0002], 2000)
@@ -188,6 +204,7 @@ def test_an_uneven_clock_holds_each_command_from_its_own_time() -> None:
     time = np.cumsum(np.random.default_rng(0).uniform(0.005, 0.015, 400))
     (episode,) = episodes(_table(time=time, ctrl__motor=np.arange(400.0), qpos__x=np.sin(time)), ["motor"], RANGES)
     assert np.isnan(episode.off_tick).all()
+    assert "of the stamps are off an even clock by more than half a sample" in episode.notes[0]
 
 
 def test_files_and_folders(tmp_path: Path) -> None:

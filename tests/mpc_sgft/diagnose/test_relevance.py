@@ -18,6 +18,7 @@ from mpc_sgft.diagnose.__main__ import main
 from mpc_sgft.diagnose.data.measured import Array
 from mpc_sgft.diagnose.fitting.hypothesis import Hypothesis
 from mpc_sgft.diagnose.verdict.relevance import Repairs, repairs
+from mpc_sgft.diagnose.verdict.repair import into
 from mpc_sgft.diagnose.verdict.tolerance import Tolerance, limits_of, parse_tolerance, spread_of
 
 FEW = ["viscous_friction", "coulomb_friction", "quadratic_drag", "actuator_offset"]
@@ -108,6 +109,21 @@ def test_a_repair_that_does_not_repair_is_not_written(slide: Path, record: Recor
     assert any("no repaired.xml" in n and told in n for n in report["notes"]), report["notes"]
 
 
+def test_a_repair_that_does_not_load_is_a_note(tmp_path: Path) -> None:
+    held = SimpleNamespace(names=["a"], fit=SimpleNamespace(terms=[object()]))
+    row = {"signal": "qpos/x", "nominal": 1.0, "repaired": 0.1, "unit": "m"}
+    data: dict[str, Any] = {"held_out": row, "verdict": "effect", "notes": [], "repaired_model": None}
+
+    def write() -> list[str]:
+        (tmp_path / "repaired.xml").write_text("<mujoco>")
+        raise ValueError("Error opening file 'gone.obj'")
+
+    into(tmp_path, data, held, Repairs(True, "all"), write)  # type: ignore[arg-type]
+    assert data["repaired_model"] is None and not list(tmp_path.iterdir())
+    (note,) = data["notes"]
+    assert note.startswith("no repaired.xml: the scene with a in it does not load") and "gone.obj" in note
+
+
 def test_no_repair_that_runs_away_in_the_scenes_own_steps(slide: Path, record: Record, tmp_path: Path) -> None:
     """A spring of 60 N/mm on 5 kg: stable in steps of less than 2 sqrt(m / k) = 18 ms."""
     slide.write_text(slide.read_text().replace('timestep="0.002"', 'timestep="0.03"'))
@@ -137,6 +153,14 @@ def test_few_windows_apart_leave_the_word_to_all(
     drops = np.array([fitted_drop] * fitted + held_drops)
     base, better = (judged(np.full(fitted + held, 10.0) - d) for d in (0.0, drops))
     assert repairs(setup, better, better, base, np.random.default_rng(0)) == Repairs(lowers, on)
+
+
+def test_parts_of_few_windows_are_few_windows() -> None:
+    """Two windows apart, each cut into twelve parts that fall alike, while those that were fitted rise."""
+    setup: Any = SimpleNamespace(fitted=np.arange(15), held=np.arange(2), parts=12, squared=np.expm1)
+    base, better = (judged(np.full(17 * 12, 10.0) - d) for d in (0.0, np.repeat([-9.0, 0.5], [15 * 12, 2 * 12])))
+    told = Repairs(False, "all 17 windows, each foretold by the others")
+    assert repairs(setup, better, better, base, np.random.default_rng(0)) == told
 
 
 def judged(errors: Array) -> Hypothesis:
