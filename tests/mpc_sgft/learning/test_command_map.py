@@ -65,7 +65,12 @@ def test_a_value_is_taught_where_plans_read_it() -> None:
     model = agent.model
     with torch.no_grad():
         model.add_command_map().weight[:, :A] = TRUTH
-    agent.train_only(("dynamics", "dynamics.command", "value_head", "q_ensemble", "policy_head"), lr=3e-3, policy_lr=3e-3, command_lr=0.0)
+    agent.train_only(
+        ("dynamics", "dynamics.command", "value_head", "q_ensemble", "policy_head"),
+        lr=3e-3,
+        policy_lr=3e-3,
+        command_lr=0.0,
+    )
     seen: list[torch.Tensor] = []
     model.value_head.register_forward_pre_hook(lambda _, x: seen.append(x[0].detach()))
     batch = make_batch()
