@@ -69,6 +69,8 @@ def deploy(cfg: DictConfig) -> int:
             if message is None:
                 raise
             raise UserError(message) from error
+        finally:
+            run.stop.restore()
     print(json.dumps(summary))
     return 0
 

@@ -116,9 +116,13 @@ def by_episode(table: Table) -> list[Table]:
     numbers, first = np.unique(which, return_index=True)
     rows = {number: which == number for number in numbers[np.argsort(first)]}
     return [
-        replace(table, name=f"{table.name}-{number:g}", columns={key: x[mine] for key, x in columns.items()})
+        replace(table, name=f"{table.name}-{_short(number)}", columns={key: x[mine] for key, x in columns.items()})
         for number, mine in rows.items()
     ]
+
+
+def _short(number: float) -> str:
+    return str(int(number)) if number == int(number) else repr(float(number))
 
 
 def _read_csv(path: Path) -> dict[str, Array]:

@@ -122,7 +122,8 @@ def table(result: Mapping[str, Any]) -> str:
     for name, row in (("before repair", result["before"]), ("after repair", result["after"])):
         count = row["rollouts_to_95"]
         more = f"> {row['real_rollouts']}" if count is None else str(count)
-        lines.append(f"{name:13} | {row['zero_shot_success']:10.0%} | {row['final_success']:8.0%} | {more:>16}")
+        zero_shot = "-" if row["zero_shot_success"] is None else f"{row['zero_shot_success']:.0%}"  # as on a robot
+        lines.append(f"{name:13} | {zero_shot:>10} | {row['final_success']:8.0%} | {more:>16}")
     return "\n".join(lines)
 
 

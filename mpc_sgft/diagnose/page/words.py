@@ -85,7 +85,9 @@ def headline(report: Row) -> str:
     kind, h = report["verdict"], report["held_out"]
     error = f"{h['nominal']:.3g} {h['unit']} of {h['signal']}"
     if kind == "none":
-        return f"Nothing that matters is missing: {report['reason']} ({error})."
+        unexplained = report["reason"].startswith("no name")  # the error may be large: it is not said to be nothing
+        lead = "Nothing is named" if unexplained else "Nothing that matters is missing"
+        return f"{lead}: {report['reason']} ({error})."
     if kind == "unknown":
         return f"Something is missing that no name in the library covers: {report['reason']}."
     said = "The model lacks this: " + "; ".join(sentence(e) for e in report["effects"])

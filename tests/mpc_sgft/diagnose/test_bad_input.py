@@ -235,9 +235,9 @@ def test_a_file_of_several_episodes_is_that_many_files(tmp_path: Path) -> None:
     columns = _table().columns
     count = len(columns["time"])
     both = {name: np.r_[values, 2 * values] for name, values in columns.items()}
-    write_csv(tmp_path / "log.csv", {"episode": np.repeat([7.0, 3.0], count), **both})
+    write_csv(tmp_path / "log.csv", {"episode": np.repeat([20250107.0, 3.0], count), **both})
     first, second = (t for t in opened(tmp_path / "log.csv").tables((), ()))
-    assert (first.name, second.name) == ("log-7", "log-3") and list(first.columns) == list(columns)
+    assert (first.name, second.name) == ("log-20250107", "log-3") and list(first.columns) == list(columns)
     for name, values in columns.items():
         np.testing.assert_allclose(first.columns[name], values, atol=1e-9)
         np.testing.assert_allclose(second.columns[name], 2 * values, atol=1e-9)

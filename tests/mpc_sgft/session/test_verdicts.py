@@ -181,6 +181,12 @@ def test_a_mark_during_a_reset_is_kept_and_the_machine_at_rest(tmp_path, monkeyp
     assert learned(tmp_path / "r") == [(1, True)]
 
 
+def test_a_deployment_gives_ctrl_c_back(tmp_path):
+    before = signal.getsignal(signal.SIGINT)
+    assert deploy.deploy(compose.compose("deploy", [*SMALL, f"run_dir={tmp_path / 'r'}", "rollouts=1"], [])) == 0
+    assert signal.getsignal(signal.SIGINT) is before
+
+
 @pytest.mark.parametrize("key", ["rerecord", None])
 def test_after_ctrl_c_no_other_rollout_begins(tmp_path, monkeypatch, key):
     """Not either where the one that is running is to be driven again."""

@@ -33,6 +33,8 @@ def test_the_comparison_counts_rollouts_to_95_percent(tmp_path: Path) -> None:
     assert after == summary | {"rollouts_to_95": 5}
     lines = table({"before": after | {"rollouts_to_95": None}, "after": after}).splitlines()
     assert lines[1].endswith("> 10") and lines[2].split("|")[1].strip() == "10%" and lines[2].endswith(" 5")
+    on_a_robot = after | {"zero_shot_success": None}
+    assert table({"before": on_a_robot, "after": on_a_robot}).splitlines()[1].split("|")[1].strip() == "-"
 
 
 def test_the_latest_run_stays_the_one_that_was_diagnosed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

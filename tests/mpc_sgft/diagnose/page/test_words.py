@@ -63,6 +63,12 @@ def test_the_headline_says_the_verdict(verdict: str, words: str) -> None:
     assert words in said
 
 
+def test_an_error_that_nothing_explains_is_not_called_nothing() -> None:
+    reason = "no name and no flexible model explains the error, 183.0 times noise and floor"
+    said = headline({"verdict": "none", "reason": reason, "effects": [], "ties": [], "held_out": HELD})
+    assert said == f"Nothing is named: {reason} (0.05 rad of qpos/elbow)."
+
+
 def test_signals_that_move_most_come_first_and_those_that_rest_not_at_all() -> None:
     moved = [("a", 0.0), ("b", 0.1), ("c", 0.5), ("d", 0.01), ("e", 0.2)]
     effect = {"changes": [{"signal": n, "unit": "rad", "rms": x} for n, x in moved]}
