@@ -9,7 +9,7 @@ import pytest
 import yaml
 from omegaconf import OmegaConf
 
-from mpc_sgft.command import cli, compose
+from mpc_sgft.command import cli, compose, resumed
 from mpc_sgft.command.errors import UserError
 from mpc_sgft.storage import run_folder
 from tests.probes import probe
@@ -63,7 +63,7 @@ def test_resume_takes_the_saved_config_and_its_folder(loops: Path, capsys) -> No
 
 def test_a_resumed_run_changes_what_is_given_as_another_setting_too(loops: Path) -> None:
     def horizons(folder: str, *words: str) -> tuple[int, int]:
-        cfg = compose.resume("deploy", folder, [compose.normalise(word) for word in words], words)
+        cfg = resumed.resume("deploy", folder, [compose.normalise(word) for word in words], words)
         return cfg.planner.horizon, cfg.method.horizon
 
     assert cli.run(probe("folder"), ["run_dir=first", "horizon=4"]) == 0
@@ -133,7 +133,7 @@ def test_a_run_of_an_earlier_version_is_refused_by_name(tmp_path, change, says):
     change(cfg)
     (tmp_path / "config.yaml").write_text(OmegaConf.to_yaml(cfg, resolve=True))
     if says is None:
-        assert compose.resume("pretrain", str(tmp_path), [], []).resume == str(tmp_path)
+        assert resumed.resume("pretrain", str(tmp_path), [], []).resume == str(tmp_path)
         return
     with pytest.raises(UserError, match=f"an earlier version wrote it .*{says}.*versions.json"):
-        compose.resume("pretrain", str(tmp_path), [], [])
+        resumed.resume("pretrain", str(tmp_path), [], [])

@@ -12,7 +12,7 @@ from envs.backends.base import BackendError, Outcome
 from envs.backends.pace import Pace
 from envs.backends.rig import Rig
 from envs.backends.route import reset_route
-from envs.backends.safety import NotSafe, Refused
+from envs.backends.safety import NotSafe, Unseen
 from envs.backends.stream import Sample
 from envs.perception.base import Detection
 from envs.task import AbstractTask, Array
@@ -83,28 +83,23 @@ class FrankaBackend:
     def reset(self, sims: NDArray[np.int_]) -> Array:
         """Recover, go to the safe posture, have the object placed, go down to a drawn start; the first observation.
 
-        A fault on the way is one of those in a row that may be recovered from.
-
         Raises:
-            BackendError: If the arm cannot get there; it is at rest.
+            BackendError: If the arm cannot get there, or the object is not seen; the arm is at rest.
         """
         if not len(sims):
             return np.zeros((0, self._observation.shape[1]))
-        start, seen = self.task.start(self.rng), None
-        while seen is None:
-            if self.fault:
-                self.rig.recover(self.fault)
-                self.fault = ""
-            self.open()
-            try:
-                seen = self._go_to(start.qpos[0, :7], self.task.place_of(start.qpos)[0])
-            except (NotSafe, BackendError) as error:
-                self.rig.end()
-                if self.rig.by_person or not isinstance(error, NotSafe) or isinstance(error, Refused):
-                    raise BackendError(f"the episode cannot begin: {error}. The arm is at rest.") from error
-                self.fault = str(error)
-                self.counters["faults"] += 1
-                log.warning("the arm was stopped on its way to the start: %s; once more", error)
+        if self.fault:
+            self.rig.recover(self.fault)
+            self.fault = ""
+        self.open()
+        start = self.task.start(self.rng)
+        place = self.task.place_of(start.qpos)[0]
+        try:
+            self._go_to(start.qpos[0, :7], place)
+            seen = self._see(place)
+        except (NotSafe, BackendError) as error:
+            self.rig.end()
+            raise BackendError(f"the episode cannot begin: {error}. The arm is at rest.") from error
         self.told, self.target = start.qpos[:, :7].copy(), start.target.copy()
         self.steps, self.note, self._rows = 0, "", []
         self._zero = self.rig.clock.now()
@@ -215,8 +210,8 @@ class FrankaBackend:
         """Stop the arm and disconnect."""
         self.rig.close()
 
-    def _go_to(self, q: Array, place: Array) -> Detection:
-        """By way of the safe posture to a start q [7], the object put at a place [3]; the sight of it."""
+    def _go_to(self, q: Array, place: Array) -> None:
+        """By way of the safe posture to a start q [7], the object put at a place [3]."""
         rig = self.rig
         rig.begin()
         rig.follow(reset_route(rig.stream.told, q, **self.way)[0])
@@ -228,7 +223,21 @@ class FrankaBackend:
             far = float(np.abs(rig.stream.state.q - q).max())
             if far > ARRIVED:
                 raise NotSafe(f"the arm stands {far:.2f} rad from the start it was sent to")
-        return rig.sight()
+
+    def _see(self, place: Array) -> Detection:
+        """The object at its place [3]; while it is hidden the arm rests where it is, and it is asked for again.
+
+        Raises:
+            NotSafe: If the arm was stopped, or it was hidden more often than faults may follow each other.
+        """
+        while True:
+            try:
+                return self.rig.sight()
+            except Unseen as error:
+                self.rig.retries.failed(str(error))
+                self.counters["faults"] += 1
+                log.warning("%s; once more", error)
+                self.rig.place(place)
 
     def _move(self, asked: Array) -> Array:
         """Aim at what an action means, as far as the gate lets it; the share of the action [1, A] that was sent."""

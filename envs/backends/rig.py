@@ -11,7 +11,7 @@ from envs.backends.arm import Arm, ArmState
 from envs.backends.base import BackendError
 from envs.backends.clock import make_clock
 from envs.backends.gripper import Gripper
-from envs.backends.safety import Gate, NotSafe, Retries, doubt, unseen
+from envs.backends.safety import Gate, NotSafe, Retries, Unseen, doubt, unseen
 from envs.backends.stream import Stream
 from envs.kinematics import tip_position
 from envs.perception.base import Detection, Perception
@@ -133,7 +133,8 @@ class Rig:
         A picture without the object says nothing: the sight before it counts until it is too old.
 
         Raises:
-            NotSafe: If none comes, or the arm was stopped.
+            Unseen: If none comes.
+            NotSafe: If the arm was stopped.
         """
         deadline, waiting = time.monotonic() + self.patience, False
         while True:
@@ -143,7 +144,7 @@ class Rig:
             if seen is not None and not why:
                 return seen
             if time.monotonic() > deadline:
-                raise NotSafe(why)
+                raise Unseen(why)
             if not waiting:
                 self.stream.hold()
                 waiting = True

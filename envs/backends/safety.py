@@ -24,8 +24,8 @@ class NotSafe(Exception):
     """A motion that is refused as a whole. The message says why."""
 
 
-class Refused(NotSafe):
-    """A path that is outside the limits: asked for again, it is refused again."""
+class Unseen(NotSafe):
+    """The object is lost; the arm itself is as it should be."""
 
 
 class Step(NamedTuple):
@@ -92,10 +92,10 @@ class Gate:
         An arm at rest sags, so the path may begin up to `OUTSIDE` out of the box, as long as it leads straight back in.
 
         Raises:
-            Refused: With the first reason, and where.
+            NotSafe: With the first reason, and where.
         """
         if not np.isfinite(path).all():
-            raise Refused("a target of the path is not finite")
+            raise NotSafe("a target of the path is not finite")
         found = self._forbidden(path[None], None)
         found["workspace box"] &= ~self._returning(path)
         for reason, where in found.items():
@@ -103,9 +103,9 @@ class Gate:
                 at = int(where[0].argmax())
                 where_at = f"{reason}, after {100 * at // len(path)} % of the path (tip {self.tip(path[at])} m)"
                 then = "" if at else ". Guide the tip into backend.limits.low/high, the joints away from their ends"
-                raise Refused(where_at + then)
+                raise NotSafe(where_at + then)
         if (np.abs(np.diff(path, axis=0)) > self.limits.speed * DQ_MAX * self.sample_dt + 1e-9).any():
-            raise Refused("joint speed")
+            raise NotSafe("joint speed")
         return path
 
     def _returning(self, path: Array) -> NDArray[np.bool_]:

@@ -98,7 +98,7 @@ def run(command: Command, argv: Sequence[str] | None = None) -> int:
 def _run(command: Command, flags: argparse.Namespace, given: list[str]) -> int:
     from omegaconf import OmegaConf
 
-    from mpc_sgft.command import compose
+    from mpc_sgft.command import compose, resumed
 
     given = compose.spread(given)
     overrides = [compose.normalise(text) for text in given]
@@ -108,7 +108,7 @@ def _run(command: Command, flags: argparse.Namespace, given: list[str]) -> int:
         compose.check(command.name, overrides, sweep=True)
         return _sweep(command, overrides)
     if flags.resume is not None:
-        cfg = compose.resume(command.name, flags.resume, overrides, given)
+        cfg = resumed.resume(command.name, flags.resume, overrides, given)
     else:
         compose.check(command.name, overrides, sweep=False)
         cfg = compose.compose(command.name, overrides, given)

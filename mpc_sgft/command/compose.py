@@ -5,9 +5,8 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping, Sequence
-from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 from hydra import compose as hydra_compose
 from hydra import initialize_config_dir
@@ -34,13 +33,6 @@ RENAMED = {  # beginnings of overrides that had another name
 }
 FILES = {"gap": "effects", "randomize": "draws"}  # groups that a file may stand for, and the mapping that it must hold
 OPEN = ("gap.effects.", "randomize.draws.")  # mappings that may gain keys on the command line
-STORED = ("model.", "train.replay.", "train.agent.entropy_coef")  # what a checkpoint holds: sizes, what has trained
-TRAINED = {  # which parts of a model train, and on what
-    f"method.{name}"
-    for name in "residual command_map command_band observation_map suspicion_margin".split()
-    + ["encoder", "reward", "simulated_episodes"]
-}
-OPTIMISED = {"lr", "policy_lr", "command_lr", "observation_lr", "encoder_lr_share", "entropy_lr"}  # its optimisers hold
 KINDS: tuple[tuple[type, tuple[type, ...], str], ...] = (  # of a default, and what may stand in its place
     (bool, (bool,), "true or false"),
     (int, (int,), "a whole number"),
@@ -137,7 +129,7 @@ def check(name: str, overrides: Sequence[str], sweep: bool) -> None:
         if override.is_delete() or not options or (isinstance(override.value(), list) and key != "experiment"):
             raise UserError(f"{override.input_line!r}: one {key} is needed. Available: {', '.join(groups[key])}.")
         base_overrides.append(f"{'+' if override.is_add() else ''}{key}={options[0]}")
-    base = _compose(name, base_overrides)
+    base = composed(name, base_overrides)
     for override in parsed:
         key = override.key_or_group
         if key in groups or key.startswith(("hydra.", "hydra/")):
@@ -146,10 +138,10 @@ def check(name: str, overrides: Sequence[str], sweep: bool) -> None:
             if (group := key.partition(".")[0]) not in groups:
                 raise UserError(f"{key}: {name} has no {group}. Its groups: {', '.join(groups)}.")
             continue
-        _check_key(base, key)
-        _check_words(override)
+        check_key(base, key)
+        check_words(override)
         if not (override.is_delete() or override.is_sweep_override()):
-            _check_kind(OmegaConf.select(base, key), override)
+            check_kind(OmegaConf.select(base, key), override)
 
 
 def compose(name: str, overrides: Sequence[str], given: Sequence[str]) -> DictConfig:
@@ -163,7 +155,7 @@ def compose(name: str, overrides: Sequence[str], given: Sequence[str]) -> DictCo
     Raises:
         UserError: If they do not make a config.
     """
-    cfg = _compose(name, overrides)
+    cfg = composed(name, overrides)
     chosen = {group: cfg.hydra.runtime.choices.get(group) for group in choices.groups()}
     with open_dict(cfg):
         del cfg["hydra"]
@@ -192,75 +184,8 @@ def complete(cfg: DictConfig, name: str, chosen: Mapping[str, str | None], given
         for key in ("checkpoint", "resume"):
             if cfg[key] is not None and Path(str(cfg[key])).exists():
                 cfg[key] = str(Path(str(cfg[key])).resolve())
-    _resolve(cfg)
+    resolve(cfg)
     check_counts(cfg)
-    OmegaConf.set_struct(cfg, True)
-    return cfg
-
-
-def resume(name: str, folder: str, overrides: Sequence[str], given: Sequence[str]) -> DictConfig:
-    """The saved config of an earlier run, to go on with exactly; plain numbers may be changed, choices may not.
-
-    What today's config gives as another setting, such as `${planner.horizon}`, and was the same, changes with it.
-
-    Args:
-        name: Command that is asked to resume.
-        folder: Run folder with a config.yaml.
-        overrides: Normalised overrides, `resume=` left out.
-        given: The overrides as the user wrote them.
-
-    Raises:
-        UserError: If there is no such run, another command wrote it, or an override cannot be applied.
-    """
-    path = Path(folder).resolve()
-    if not (path / "config.yaml").is_file():
-        raise UserError(f"cannot resume {folder}: no config.yaml in it. Give the run folder, e.g. runs/push/latest.")
-    cfg = OmegaConf.load(path / "config.yaml")
-    if not isinstance(cfg, DictConfig) or cfg.get("command") != name:
-        wrote = cfg.get("command") if isinstance(cfg, DictConfig) else None
-        raise UserError(f"cannot resume {folder} with {name}: {wrote or 'another program'} wrote it.")
-    differs = [f"{t} has moved since" for t in _targets(cfg) if find_spec(t.rpartition(".")[0]) is None]
-    taken_out = tuple(text[1:].partition("=")[0] for text in cfg.overrides if text.startswith("~"))
-    today = _of_today(name, cfg)
-    lacking = (key for key in _lacking(today, cfg) if not key.startswith(taken_out))
-    differs += [f"it had no {key}" for key in lacking]
-    if OmegaConf.select(cfg, "planner.temperature", default=0) > 1:
-        differs += ["its planner.temperature was in reward units"]
-    if differs:
-        raise UserError(
-            f"cannot resume {folder}: an earlier version wrote it ({differs[0]}). "
-            "Go on with that version; versions.json there names its commit."
-        )
-    if OmegaConf.select(cfg, "backend.dry_run", default=False):
-        raise UserError(f"cannot resume {folder}: it was a dry run, in which nothing moves. Start a run.")
-    if "quiet" in cfg:
-        cfg.quiet = False  # for each call anew: without a page there are no keys
-    parsed, raw = parse(overrides), cast(dict[str, Any], OmegaConf.to_container(today))
-    named = {override.key_or_group for override in parsed}
-    for override in parsed:
-        key = override.key_or_group
-        if key == "backend.dry_run" and override.value():
-            raise UserError("--dry-run is a run of its own. Leave --resume out; that run stays as it is.")
-        if (
-            key in (*choices.groups(), "run_dir", "checkpoint", "seed", "eval_seed")
-            or key.startswith(("gap.", *STORED))
-            or key.rpartition(".")[2] in OPTIMISED
-            or key in TRAINED
-            or override.is_delete()
-        ):
-            raise UserError(f"{key!r} cannot change in a resumed run. Start a new one, or leave it out.")
-        if not key.startswith(OPEN):
-            _check_key(cfg, key)
-        _check_words(override)
-        _check_kind(OmegaConf.select(today, key, default=OmegaConf.select(cfg, key)), override)
-        before = OmegaConf.select(cfg, key)
-        followers = [other for other in _given_as(raw, key) if OmegaConf.select(cfg, other) == before]
-        for changed in (key, *(other for other in followers if other not in named)):
-            OmegaConf.update(cfg, changed, override.value(), force_add=changed.startswith(OPEN))
-    _resolve(cfg)
-    check_counts(cfg)
-    cfg.resume = cfg.run_dir = str(path)
-    cfg.overrides = [*cfg.overrides, *given]
     OmegaConf.set_struct(cfg, True)
     return cfg
 
@@ -279,7 +204,12 @@ def first_line(err: BaseException) -> str:
     return line if line.endswith((".", "?", "!")) else line + "."
 
 
-def _compose(name: str, overrides: Sequence[str]) -> DictConfig:
+def composed(name: str, overrides: Sequence[str]) -> DictConfig:
+    """What Hydra makes of normalised overrides, its own settings included.
+
+    Raises:
+        UserError: If it refuses them.
+    """
     sweep = GlobalHydra.instance().hydra  # a job of a sweep composes while Hydra runs it
     GlobalHydra.instance().clear()
     try:
@@ -291,7 +221,12 @@ def _compose(name: str, overrides: Sequence[str]) -> DictConfig:
         GlobalHydra.instance().hydra = sweep
 
 
-def _resolve(cfg: DictConfig) -> None:
+def resolve(cfg: DictConfig) -> None:
+    """Put numbers in the place of references, in `cfg` itself.
+
+    Raises:
+        UserError: If one leads nowhere.
+    """
     try:
         OmegaConf.resolve(cfg)
     except OmegaConfBaseException as err:
@@ -327,46 +262,6 @@ def _literal(value: Any) -> str:
     return json.dumps(value)
 
 
-def _targets(node: Any) -> list[str]:
-    """Our own classes and functions that a saved config names."""
-    if isinstance(node, DictConfig):
-        here = node.get("_target_")
-        inner = [target for key in node if not OmegaConf.is_missing(node, key) for target in _targets(node[key])]
-        return [here, *inner] if isinstance(here, str) and here.startswith("mpc_sgft.") else inner
-    return []
-
-
-def _of_today(name: str, cfg: DictConfig) -> DictConfig:
-    """What a command's config has now with the choices of a saved one; their gap is a list of its own."""
-    groups = choices.groups_of(name)
-    chosen = {group: option for group, option in cfg.chosen.items() if option in groups.get(group, ())}
-    kept = [f"{group}={option}" for group, option in chosen.items() if group not in ("gap", "experiment")]
-    return _compose(name, kept)
-
-
-def _lacking(today: DictConfig, cfg: DictConfig, before: str = "") -> list[str]:
-    """Settings of today's config that a saved one has not."""
-    out = []
-    for key in (str(key) for key in today if key != "hydra"):
-        if key not in cfg:
-            out.append(before + key)
-        elif not OmegaConf.is_missing(today, key) and isinstance(OmegaConf.select(today, key), DictConfig):
-            there = cfg[key]
-            out += _lacking(today[key], there, f"{before}{key}.") if isinstance(there, DictConfig) else []
-    return out
-
-
-def _given_as(node: Mapping[str, Any], key: str, before: str = "") -> list[str]:
-    """Settings of a composed config that are `${key}`; a saved one holds only what they were."""
-    out = []
-    for name, value in node.items():
-        if isinstance(value, dict):
-            out += _given_as(value, key, f"{before}{name}.")
-        elif value == f"${{{key}}}":
-            out.append(before + name)
-    return out
-
-
 def _values(override: Override) -> list[str]:
     """The words an override may take: one, or those of a simple sweep or list; none for null and for ranges."""
     if override.is_delete():
@@ -379,7 +274,8 @@ def _values(override: Override) -> list[str]:
     return [str(item) for item in value] if isinstance(value, list) else [str(value)]
 
 
-def _check_key(cfg: Any, key: str) -> None:
+def check_key(cfg: Any, key: str) -> None:
+    """Raise UserError with the names that exist if a config has no such key."""
     node, before = cfg, ""
     for part in key.replace("/", ".").split("."):
         if isinstance(node, ListConfig) and part.isdigit() and int(part) < len(node):
@@ -393,14 +289,16 @@ def _check_key(cfg: Any, key: str) -> None:
         before += part + "."
 
 
-def _check_words(override: Override) -> None:
+def check_words(override: Override) -> None:
+    """Raise UserError if a setting that takes one of a few words gets another."""
     key = override.key_or_group
     for word in _values(override) if key in choices.WORDS else []:
         if word not in choices.WORDS[key]:
             raise unknown(key, word, choices.WORDS[key])
 
 
-def _check_kind(default: Any, override: Override) -> None:
+def check_kind(default: Any, override: Override) -> None:
+    """Raise UserError if a value is of another kind than the default that it replaces."""
     value = override.value()
     if type(default) is int and override.key_or_group.rpartition(".")[2].isdigit():
         default = float(default)  # of a list, whose other numbers may have fractions

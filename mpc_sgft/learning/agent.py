@@ -161,11 +161,12 @@ class Agent:
 
         zs = losses.imagine(model.dynamics, first_z, data.action)  # [T + 1, B, D]
         q_logits = model.q_logits(zs[:-1], data.action)  # [E, T, B, bins]
+        as_read = model.dynamics.as_simulated(zs).detach()  # by V at a plan's end
         per_step = {
             "consistency_loss": losses.consistency_loss(zs[1:], encoded[1:]),
             "reward_loss": losses.two_hot_loss(model.reward_logits(zs[:-1], data.action, zs[1:]), target.reward),
             "q_loss": losses.two_hot_loss(q_logits, target.q.expand_as(q_logits)).mean(0),
-            "value_loss": losses.two_hot_loss(self._value_logits(zs), target.value),
+            "value_loss": losses.two_hot_loss(model.value_head(as_read), target.value),
         }
         if policy_too:
             per_step["decoder_loss"] = self._decoder_loss(encoded, data.observation)
@@ -380,10 +381,6 @@ class Agent:
 
     def _trains(self, name: str) -> bool:
         return any(name == part or name.startswith(part + ".") for part in self.trainable)
-
-    def _value_logits(self, zs: Tensor) -> Tensor:
-        """Of V where plans read it, behind the command map; the loss moves V alone. [..., D] -> [..., bins]."""
-        return self.model.value_head(self.model.dynamics.as_simulated(zs.detach()).detach())
 
     def _decoder_loss(self, z: Tensor, observation: Tensor) -> Tensor:
         wanted = self.model.normalizer(observation)[..., : self.model.sizes["decode_dim"]]

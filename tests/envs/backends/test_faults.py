@@ -152,8 +152,8 @@ def test_a_robot_that_disappears_ends_the_session_with_a_line(robot: FrankaBacke
     stand_in.scene = SimpleNamespace(close=stand_in.scene.close)
 
 
-def test_a_doubt_on_the_way_to_a_start_is_recovered_from(robot: FrankaBackend, stand_in: StandIn) -> None:
-    """The object is hidden when the arm looks for it, by a hand, say. The arm rests while somebody puts it down."""
+def test_an_object_that_is_hidden_before_an_episode_is_asked_for_again(robot: FrankaBackend, stand_in: StandIn) -> None:
+    """By a hand, say. The arm rests while somebody puts it down."""
     put, place = [], robot.rig._place
 
     def hide_once(position: np.ndarray) -> None:
@@ -165,6 +165,21 @@ def test_a_doubt_on_the_way_to_a_start_is_recovered_from(robot: FrankaBackend, s
     robot.reset(np.arange(1))
     assert put == [None, None] and robot.counters["faults"] == robot.rig.retries.faults == 1
     assert not robot.send(np.array([[0.0, 0.3]])).invalid[0]
+
+
+def test_an_arm_that_was_stopped_on_its_way_to_a_start_stays_at_rest(robot: FrankaBackend, stand_in: StandIn) -> None:
+    """Somebody may be in its way: it does not move again by itself."""
+    put, place = [], robot.rig._place
+
+    def strike(position: np.ndarray) -> None:
+        put.append(position)
+        place(position)
+        stand_in.scene.tell(fault="reflex")
+
+    robot.rig._place = strike
+    with pytest.raises(BackendError, match="cannot begin: .*The arm is at rest"):
+        robot.reset(np.arange(1))
+    assert len(put) == 1 and robot.rig.running is None
 
 
 def test_a_start_out_of_the_box_is_said_at_once(robot: FrankaBackend) -> None:

@@ -11,7 +11,7 @@ from omegaconf import DictConfig
 from safetensors.torch import load_file
 
 from envs.backends.base import BackendError
-from mpc_sgft.command import compose
+from mpc_sgft.command import compose, resumed
 from mpc_sgft.command.errors import Stopped, UserError
 from mpc_sgft.learning.transfer import Transfer
 from mpc_sgft.runs import build, deploy
@@ -56,7 +56,7 @@ def run(folder: Path, operator: Script | None, *more: str, judged: bool = True) 
 
 def go_on(folder: Path, operator: Script | None, *more: str) -> dict:
     """Resume a run that nobody judges."""
-    return loop(compose.resume("deploy", str(folder), more, more), operator, judged=False)
+    return loop(resumed.resume("deploy", str(folder), more, more), operator, judged=False)
 
 
 def loop(cfg: DictConfig, operator: Script | None, judged: bool) -> dict:
