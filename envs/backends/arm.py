@@ -13,6 +13,7 @@ from envs.backends.client import knock, load_franky, within
 
 Array = NDArray[np.float64]
 FCI_PORT = 1337
+NULL_STIFFNESS = 10.0  # [N m/rad] of the pull to a posture, which leaves the tip where it is
 
 
 class ArmState(NamedTuple):
@@ -68,6 +69,7 @@ class Arm:
         self.stiffness, self.cartesian_stiffness = np.array(stiffness, float), cartesian_stiffness
         self.thresholds, self.load = (torque_threshold, force_threshold), (load_mass, load_centre)
         self.franky = load_franky()
+        self.posture: Array | None = None  # [7] rad that the Cartesian interface keeps near; where it begins if None
         self.robot: Any = None
         self.tracker: Any = None
         self.newest_time = 0.0  # [s] on the robot's clock, of the last state that was read
@@ -114,8 +116,7 @@ class Arm:
             self.tracker = self._call(lambda: f.JointImpedanceTracker(self.robot, stiffness=self.stiffness))
             return
         along, about = (float(x) for x in self.cartesian_stiffness)
-        q = self.read().q
-        posture = f.PostureTask(q, 10.0)
+        posture = f.PostureTask(self.read().q if self.posture is None else self.posture, NULL_STIFFNESS)
         self.tracker = self._call(
             lambda: f.CartesianImpedanceTracker(
                 self.robot, translational_stiffness=along, rotational_stiffness=about, posture_task=posture

@@ -213,6 +213,7 @@ class FrankaBackend:
     def _go_to(self, q: Array, place: Array) -> None:
         """By way of the safe posture to a start q [7], the object put at a place [3]."""
         rig = self.rig
+        rig.arm.posture = q  # else what the elbow is off by adds up from one reset to the next
         rig.begin()
         rig.follow(reset_route(rig.stream.told, q, **self.way)[0])
         rig.place(place)

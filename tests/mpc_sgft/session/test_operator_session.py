@@ -103,7 +103,7 @@ def test_a_person_runs_a_session(tmp_path: Path) -> None:
     assert marked.outcome and marked.outcome["success"] and marked.outcome["task_success"] is False
     assert len(marked.transitions["step"]) == STEPS and len(marked.joints["time"]) > 100
     assert taken.outcome and taken.outcome["intervened"] and "taken over by a person" in taken.outcome["aborted"]
-    assert [k["key"] for k in taken.keys] == ["takeover", "takeover"] and taken.guided["qpos"].shape[1] == 7
+    assert [k["key"] for k in taken.keys] == ["takeover", "takeover", "pause"] and taken.guided["qpos"].shape[1] == 7
     assert (np.diff(taken.guided["time"]) >= 0).all() and taken.guided["time"][0] >= taken.joints["time"][-1]
     assert again.outcome and "pressed stop" in again.outcome["aborted"]
 
