@@ -179,6 +179,20 @@ def notes_of_split(episodes: int, held: Sequence[int] | Index) -> list[str]:
     return notes
 
 
+def notes_of_short(names: Sequence[str], used: Sequence[int] | Index, window: float) -> list[str]:
+    """What must be said of episodes that fill no window.
+
+    Args:
+        names: Of all episodes.
+        used: Episode of each window.
+        window: Length of a window [s].
+    """
+    short = [name for i, name in enumerate(names) if i not in used]
+    if not short:
+        return []
+    return [f"not used, too short for a window of {window:.3g} s: {', '.join(short)}; a shorter --window uses more"]
+
+
 def notes_of_rest(signal: str, unit: str, errors: Array, held: Sequence[int] | Index) -> list[str]:
     """What must be said where what is held out hardly shows what the nominal model misses: at the end of a motion, say.
 

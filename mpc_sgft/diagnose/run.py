@@ -32,6 +32,7 @@ from mpc_sgft.diagnose.rows import (
     candidate_rows,
     effect_rows,
     notes_of_rest,
+    notes_of_short,
     notes_of_split,
     reduction,
     trace_rows,
@@ -143,11 +144,13 @@ def run(
         residual_model = None if settled(best) else fit_residual_model(setup, best, sizes, rng)
         verdict = reach_verdict(setup, hypotheses, residual_model, rng, tolerance_of(setup, tolerance))
         bar.update(100 - bar.n)
-    notes = [*plant.notes, *(n for e in recorded for n in e.notes), *notes_of_split(len(recorded), setup.held)]
+    notes = [*plant.notes, *(n for e in recorded for n in e.notes)]
     held = verdict.there if traces else verdict.best
     left = residual_model and residual_model.error
     fitted = setup.problem.replayer
-    own = Replayer(plant, fitted.episodes, fitted.windows.samples * fitted.dt, fitted.signals)
+    used, length = fitted.windows.episode, fitted.windows.samples * fitted.dt
+    notes += [*notes_of_short([e.name for e in recorded], used, length), *notes_of_split(len(set(used)), setup.held)]
+    own = Replayer(plant, fitted.episodes, length, fitted.signals)
     unstable = runs_away(own, fitted, held)
     if unstable:
         notes.append(f"errors are those in steps of {1e3 * fitted.h:g} ms, not in the scene's own")

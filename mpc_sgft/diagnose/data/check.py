@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from difflib import get_close_matches
 
 import numpy as np
@@ -99,6 +100,8 @@ def episodes(
     for k, rows in enumerate(pieces):
         name = table.name if len(pieces) == 1 else f"{table.name}#{k}"
         built.append(_even(name, columns, rows, dt, clock, actuators, list(joints), notes if k == 0 else ()))
+    if len(pieces) > 1:
+        built = [replace(episode, piece=True) for episode in built]
     return built
 
 

@@ -72,6 +72,7 @@ class Episode:
         signals: `qpos/…`, `qvel/…`, `force/…`, `sensor/…` -> [T].
         notes: What was noticed while reading, in words.
         off_tick: Seconds after its tick at which each sample was read, negative before, [T] or a number; nan: unknown.
+        piece: Whether pauses cut it out of a longer recording.
     """
 
     name: str
@@ -80,6 +81,7 @@ class Episode:
     signals: dict[str, Array]
     notes: tuple[str, ...] = field(default=())
     off_tick: Array | float = 0.0
+    piece: bool = False
 
     @property
     def seconds(self) -> float:

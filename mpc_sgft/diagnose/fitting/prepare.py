@@ -21,6 +21,7 @@ from mpc_sgft.diagnose.simulation.replay import Replayer
 
 WINDOW = 1.0  # [s] where the data allow it
 LEAST = 10  # samples of a window
+SPARE = 0.1  # share of the data that may be lost in pieces too short for a window
 MIN_WINDOWS = 4  # shorter windows rather than fewer
 UNITS = 24  # parts of windows to compare sets on, at least
 FEW_WINDOWS = 12  # fewer: one may hold all that shows an effect
@@ -80,8 +81,16 @@ class Setup(Generic[P]):
 
 
 def default_window(episodes: Sequence[Episode], joints: Sequence[str]) -> float:
-    """At most WINDOW, so that windows fill the shortest episode and there are enough of them; LEAST samples."""
-    dt, shortest = episodes[0].dt, min(len(e.ctrl) - 1 - smooth(e, joints).half for e in episodes)
+    """At most WINDOW, so that windows fill the shortest episode and there are enough of them; LEAST samples.
+
+    The shortest pieces between pauses count for nothing as long as they hold little of the data together.
+    """
+    spare, counting = SPARE * sum(e.seconds for e in episodes), []
+    for e in sorted(episodes, key=lambda e: (not e.piece, e.seconds)):
+        spare -= e.seconds
+        if not e.piece or spare < 0:
+            counting.append(e)
+    dt, shortest = episodes[0].dt, min(len(e.ctrl) - 1 - smooth(e, joints).half for e in counting)
     longest = min(WINDOW, sum(e.seconds for e in episodes) / MIN_WINDOWS)
     pieces = int(np.ceil(shortest * dt / longest - 0.01))
     return max(LEAST, shortest // pieces) * dt
@@ -240,24 +249,32 @@ def split(replayer: Any, held_out: float | Sequence[str] | None) -> tuple[Index,
         held_out: Share of the data, or names of episodes; a quarter if None.
 
     Raises:
-        UserError: If a named episode does not exist or one side would be empty.
+        UserError: If a named episode does not exist or fills no window, or one side would be empty.
     """
     w, names = replayer.windows, [e.name for e in replayer.episodes]
+    filled = np.unique(w.episode)  # episodes that are too short have no window
     everything = np.arange(len(w.start))
     if held_out is not None and not isinstance(held_out, int | float):
         wrong = [n for n in held_out if n not in names]
         if wrong:
             raise UserError(f"held-out episode {wrong[0]!r} is not in the data. There are: {', '.join(names)}.")
+        long = [names[i] for i in filled]
+        short = [n for n in held_out if n not in long]
+        if short:
+            raise UserError(
+                f"held-out episode {short[0]!r} is too short for a window. Long enough are: {', '.join(long)}. Hold "
+                "one of them out, or give a shorter --window."
+            )
         apart = np.isin(np.array(names)[w.episode], list(held_out))
     else:
         share = 0.25 if held_out is None else float(held_out)
         if not 0 < share < 1:
             raise UserError(f"held-out share {share}: allowed are numbers between 0 and 1, or episode names.")
-        if len(names) >= 4:
-            apart = w.episode >= len(names) - max(1, round(share * len(names)))
+        if len(filled) >= 4:
+            apart = np.isin(w.episode, filled[-max(1, round(share * len(filled))) :])
         else:
             apart = np.zeros(len(everything), bool)
-            for i in range(len(names)):  # the end of each, so that every motion is on both sides
+            for i in filled:  # the end of each, so that every motion is on both sides
                 mine = np.flatnonzero(w.episode == i)
                 apart[mine[len(mine) - max(1, round(share * len(mine))) :]] = len(mine) > 1
     if apart.all() or not apart.any():

@@ -3,22 +3,35 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import mujoco
 import numpy as np
 import pytest
 
+from mpc_sgft.command.errors import UserError
 from mpc_sgft.diagnose import diagnose
 from mpc_sgft.diagnose import run as running
 from mpc_sgft.diagnose.candidates.library import make_term
 from mpc_sgft.diagnose.data.check import episodes
-from mpc_sgft.diagnose.data.measured import Episode, read_table, write_csv
+from mpc_sgft.diagnose.data.measured import Episode, Table, read_table, write_csv
 from mpc_sgft.diagnose.data.smooth import noise_of
+from mpc_sgft.diagnose.data.units import Axis
 from mpc_sgft.diagnose.fitting import search as searching
 from mpc_sgft.diagnose.fitting.fit import Discrepancy, fit
 from mpc_sgft.diagnose.fitting.hypothesis import Hypothesis, judge_fit
-from mpc_sgft.diagnose.fitting.prepare import Problem, Setup, default_signals, near_fit, prepare, typical, typical_sizes
+from mpc_sgft.diagnose.fitting.prepare import (
+    Problem,
+    Setup,
+    default_signals,
+    default_window,
+    near_fit,
+    prepare,
+    typical,
+    typical_sizes,
+)
+from mpc_sgft.diagnose.rows import notes_of_short
 from mpc_sgft.diagnose.simulation.plant import Plant, load_plant
 
 
@@ -124,6 +137,35 @@ def test_what_steps_are_known_to_leave_out_is_no_error_of_the_model(slide: Path,
     recorded = episodes(read_table(tmp_path / "stiff.csv"), plant.actuators, plant.axes())
     setup = prepare(plant, recorded, [], window=None, signals=None, held_out=None)
     assert running.tolerance_of(setup, 0.0005).allows(setup.baseline)
+
+
+@pytest.mark.parametrize("paused", [True, False])
+def test_a_short_piece_after_a_pause_makes_windows_no_shorter(paused: bool) -> None:
+    t = np.arange(8000) * 1e-3
+    q = np.sin(np.pi * t) + 5e-5 * np.random.default_rng(0).standard_normal(8000)
+    there = np.arange(8000) // 10 != 793 if paused else np.ones(8000, bool)
+    columns = {"time": t, "ctrl/motor": np.sin(t), "qpos/x": q}
+    table = Table("run", {name: x[there] for name, x in columns.items()})
+    recorded = episodes(table, ["motor"], {"x": Axis(slide=True)})
+    assert len(recorded) == 1 + paused
+    assert 0.95 < default_window(recorded, ["x"]) == default_window(recorded[:1], ["x"])
+    shorts = [replace(e, piece=False) for e in recorded]  # episodes of their own all count
+    assert (default_window(shorts, ["x"]) < 0.1) == paused
+
+
+def test_episodes_that_fill_no_window_are_told_and_not_held_out(slide: Path, record: Callable[..., Path]) -> None:
+    data = [record(name, seconds=s) for name, s in (("a", 8.0), ("b", 8.0), ("c", 0.8), ("d", 0.8))]
+    plant = load_plant(slide)
+    recorded = [episodes(read_table(path), plant.actuators, plant.axes())[0] for path in data]
+    setup = prepare(plant, recorded, [], window=1.0, signals=None, held_out=None)
+    w = setup.problem.replayer.windows
+    assert set(w.episode[setup.fitted]) == set(w.episode[setup.held]) == {0, 1}
+    assert notes_of_short("abcd", w.episode, 1.0) == [
+        "not used, too short for a window of 1 s: c, d; a shorter --window uses more"
+    ]
+    assert not notes_of_short("ab", w.episode, 1.0)
+    with pytest.raises(UserError, match=r"held-out episode 'd' is too short for a window. Long enough are: a, b"):
+        prepare(plant, recorded, [], window=1.0, signals=None, held_out=["d"])
 
 
 def test_sensors_of_the_scene_are_compared_too_and_nothing_that_only_ends_like_one() -> None:
