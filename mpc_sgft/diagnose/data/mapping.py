@@ -42,9 +42,10 @@ UNITS = {
     "V": 1.0,
 }
 FORM = "[FACTOR*]COLUMN[ UNIT][ + OFFSET]"
+EXAMPLE = "{}=-2*enc deg + 0.1"
 KINDS = ("time", "ctrl/", "qpos/", "qvel/", "force/", "sensor/")
 PATTERN = re.compile(
-    r"""^\s*(?:(?P<factor>[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*\*\s*|(?P<minus>-))?
+    r"""^\s*(?:(?P<factor>[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*\*\s*|(?P<minus>-)\s*)?
     (?P<column>.+?)
     (?:\s+(?P<unit>[A-Za-z]+(?:/s)?))?
     (?:\s+(?P<sign>[-+])\s+(?P<offset>(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?))?\s*$""",
@@ -89,7 +90,7 @@ def parse_mapping(entries: Mapping[str, str | Source]) -> dict[str, Source]:
             continue
         match = PATTERN.match(text)
         if not match:
-            raise UserError(f"--map {name}={text}: write {name}={FORM}, such as {name}=-2*enc deg + 0.1.")
+            raise UserError(f"--map {name}={text}: write {name}={FORM}, such as {EXAMPLE.format(name)}.")
         column, unit = match["column"], match["unit"] or ""
         if unit not in UNITS:  # a column may have a name of several words
             column, unit = f"{column} {unit}", ""
@@ -110,6 +111,8 @@ def mapped(table: Table, mapping: Mapping[str, Source]) -> Table:
         if source.column not in has:
             near = get_close_matches(source.column, has, 1, 0.5)
             hint = f" Is it {near[0]!r}?" if near else ""
+            if any(sign in source.column for sign in ("*", "+", " -")):
+                hint = f" Write {name}={FORM}, such as {EXAMPLE.format(name)}."
             raise UserError(
                 f"{table.name}: --map {name}: no column {source.column!r}.{hint} The file has: {', '.join(has)}."
             )

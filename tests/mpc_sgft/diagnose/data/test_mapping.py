@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -66,6 +67,19 @@ def test_a_column_that_is_not_there_is_told_with_the_nearest() -> None:
     table = Table("run", {"time": np.zeros(2), "encoder": np.zeros(2)})
     with pytest.raises(UserError, match="no column 'encodr'. Is it 'encoder'"):
         mapped(table, parse_mapping({"qpos/a": "encodr deg"}))
+
+
+def test_spaces_after_a_minus_are_no_part_of_the_name() -> None:
+    assert parse_mapping({"qpos/a": "- enc deg"}) == {"qpos/a": Source("enc", pytest.approx(-np.pi / 180), 0.0)}
+
+
+@pytest.mark.parametrize("source", ["enc*2", "enc deg+0.1", "enc deg -0.1"])
+def test_what_looks_like_a_formula_is_told_its_form(source: str) -> None:
+    table = Table("run", {"time": np.zeros(2), "enc": np.zeros(2)})
+    with pytest.raises(UserError, match=re.escape("Write qpos/a=[FACTOR*]COLUMN[ UNIT][ + OFFSET], such as qpos/a=-2")):
+        mapped(table, parse_mapping({"qpos/a": source}))
+    named = mapped(replace(table, columns={"time": np.zeros(2), source: np.ones(2)}), parse_mapping({"qpos/a": source}))
+    assert named.columns["qpos/a"] == pytest.approx(1.0)  # unless it is a name
 
 
 @pytest.mark.parametrize("source", ["1.2.3*x", ".*x", "x + 1.2.3"])
