@@ -125,7 +125,7 @@ def diagnose_run(
             verdict = verdict._replace(kind="unknown", reason=reason)
         bar.update(100 - bar.n)
     notes = [*deployment.notes, *notes_of_split(len(deployment.episodes), setup.held)]
-    held = verdict.there if traces else verdict.best
+    held = verdict.whole if traces else verdict.best
     report = assemble(setup, hypotheses, verdict, held, notes, rng, residual_model and residual_model.error)
     if out is not None:
         lowers = repairs(setup, held, verdict.there, hypotheses[0], rng)

@@ -145,7 +145,7 @@ def run(
         verdict = reach_verdict(setup, hypotheses, residual_model, rng, tolerance_of(setup, tolerance))
         bar.update(100 - bar.n)
     notes = [*plant.notes, *(n for e in recorded for n in e.notes)]
-    held = verdict.there if traces else verdict.best
+    held = verdict.whole if traces else verdict.best
     left = residual_model and residual_model.error
     fitted = setup.problem.replayer
     used, length = fitted.windows.episode, fitted.windows.samples * fitted.dt

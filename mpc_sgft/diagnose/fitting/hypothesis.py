@@ -96,6 +96,14 @@ def without_effect(setup: Setup[Any], e: Hypothesis, i: int, hypotheses: list[Hy
     return _fitted(setup, terms, values, e.effects - 1, hypotheses)
 
 
+def with_effects(
+    setup: Setup[Any], e: Hypothesis, terms: list[Term], values: list[Array], hypotheses: list[Hypothesis]
+) -> Hypothesis:
+    """A set with further effects, as it was fitted, or fitted now from these values."""
+    all_terms, all_values = [*e.fit.terms, *terms], [*e.fit.values, *values]
+    return _fitted(setup, all_terms, all_values, e.effects + len(terms), hypotheses)
+
+
 def simpler(setup: Setup[Any], e: Hypothesis, hypotheses: list[Hypothesis]) -> list[Hypothesis]:
     """The sets with an effect in place of one that includes it, as they were fitted, or fitted now.
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from mpc_sgft.diagnose.fitting import judge
 from mpc_sgft.diagnose.fitting.fit import Fit
-from mpc_sgft.diagnose.fitting.hypothesis import Hypothesis
+from mpc_sgft.diagnose.fitting.hypothesis import Hypothesis, with_effects
 from mpc_sgft.diagnose.fitting.prepare import NOISE, Setup
 from mpc_sgft.diagnose.fitting.residual_model import ResidualModel
 from mpc_sgft.diagnose.verdict.naming import as_given, canonical, choose, equivalence, find_ties, no_larger, settled
@@ -44,6 +44,7 @@ class Verdict(NamedTuple):
         shares: What each effect of the best set does beyond the others.
         traces: Effects that are there and do not matter, largest first.
         intervals: Of the best set's parameters, effect by effect.
+        whole: The best set with the traces: `there`, unless another than what matters of that is named.
     """
 
     kind: str
@@ -55,6 +56,7 @@ class Verdict(NamedTuple):
     shares: list[Relevance]
     traces: list[Relevance]
     intervals: list[Interval]
+    whole: Hypothesis
 
 
 def reach_verdict(
@@ -88,6 +90,7 @@ def reach_verdict(
     def alike(a: Fit, b: Fit) -> bool:
         return tolerance.asked and tolerance.alike(a, b, told, TIED)
 
+    matters = best
     best, ties = as_given(setup, best, find_ties(setup, best, there, hypotheses, rng, alike))
     declared = [(e, equivalence(best, e)) for e in ties]
     kind, reason = _no_name(setup, there, best, base, residual_model, rng, tolerance)
@@ -105,8 +108,11 @@ def reach_verdict(
         if open_ties:
             reason = f"{_list(best)} and {len(open_ties)} others tie"
     shares = shares_of(setup, best, there, hypotheses, rng)
+    whole, beside = there, [t for t in traces if t.term.label not in best.names]
+    if best.key != matters.key:
+        whole = with_effects(setup, best, [t.term for t in beside], [t.value for t in beside], hypotheses)
     sure = sure_intervals(setup, best, tolerance, told)
-    return Verdict(kind, best, named, probability, reason, there, shares, traces, sure)
+    return Verdict(kind, best, named, probability, reason, there, shares, traces, sure, whole)
 
 
 def _no_name(

@@ -53,6 +53,22 @@ def test_a_tie_that_needs_another_mass_loses_against_one_that_finds_it_as_given(
     )
 
 
+def test_what_is_repaired_with_traces_holds_the_name_that_a_convention_prefers() -> None:
+    problem, fitted, none, rng = Lines(), np.arange(18), np.zeros(1), np.random.default_rng(5)
+    c, one = problem.columns, np.ones(1)
+    c |= {"gravity_tilt": c["b"], "actuator_offset": c["b"]}
+    problem.y = 6 * c["b"] + 0.3 * c["c"] + rng.normal(size=problem.y.shape)
+    setup = Setup(problem, fitted, np.arange(18, 24), fitted // 3, fit(problem, [], [], fitted), none, none, np.log1p)
+    setup = replace(setup, squared=np.expm1)
+    names = (["gravity_tilt"], ["actuator_offset"], ["gravity_tilt", "c"])
+    sets = [judge_fit(setup, fit(problem, [term(n) for n in x], [one] * len(x), fitted)) for x in names]
+    sets[0] = sets[0]._replace(errors=sets[0].errors - 1e-3)
+    verdict = reach_verdict(setup, [judge_fit(setup, setup.baseline), *sets], None, rng, motion(problem, 0.1))
+    assert (verdict.best.names, verdict.there.names) == (["actuator_offset"], ["gravity_tilt", "c"])
+    assert verdict.whole.names == ["actuator_offset", "c"]
+    assert verdict.whole.values[0] == pytest.approx(6, abs=0.2)
+
+
 @pytest.mark.parametrize(
     ("before", "after", "kind"), [(60.0, 8.0, "unknown"), (60.0, 6.0, "effect"), (6.0, 1.9, "effect")]
 )
