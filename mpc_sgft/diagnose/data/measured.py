@@ -164,20 +164,28 @@ def _read_parquet(path: Path) -> dict[str, Array]:
 
 
 def _read_mcap(path: Path) -> Table:
+    """An episode of `deploy`.
+
+    A robot's backend names itself, and records with a state the command that it sends then. The simulator does not: it
+    records with a state the command and force of the step that ends there, which are of the sample before.
+    """
     try:
         episode = read_episode(path)
     except ValueError as error:
         raise UserError(str(error)) from error
     if not episode.joints:
         raise UserError(f"{path}: no joint samples in it ({episode.lost or 'the backend recorded none'}).")
-    columns: dict[str, Array] = {"time": episode.joints["time"]}
+    late = 0 if "backend" in episode.metadata else 1
+    count = len(episode.joints["time"]) - late
+    columns: dict[str, Array] = {"time": episode.joints["time"][:count]}
     joints, actuators = episode.metadata.get("joint_names", []), episode.metadata.get("actuator_names", [])
     for kind, names in (("qpos", joints), ("qvel", joints), ("ctrl", actuators), ("force", actuators)):
-        values = episode.joints.get(kind)
+        values, first = episode.joints.get(kind), late if kind in ("ctrl", "force") else 0
         for i, name in enumerate(names if values is not None else []):
             if i < values.shape[1]:  # pyright: ignore[reportOptionalMemberAccess]
-                columns[f"{kind}/{name}"] = values[:, i]  # pyright: ignore[reportOptionalSubscript]
-    return Table(path.stem, columns, episode.lost)
+                columns[f"{kind}/{name}"] = values[first : first + count, i]  # pyright: ignore[reportOptionalSubscript]
+    told = "commands and forces of the simulator's record act in the step before their time: read one sample earlier"
+    return Table(path.stem, columns, episode.lost, (told,) if late else ())
 
 
 def write_csv(path: Path, columns: dict[str, Array]) -> None:

@@ -288,6 +288,23 @@ def test_a_truncated_mcap_is_read_as_far_as_it_is_whole(tmp_path: Path) -> None:
     assert "whole steps kept" in episode.notes[0]
 
 
+@pytest.mark.parametrize(("backend", "late"), [({}, 1), ({"backend": "franka"}, 0)])
+def test_commands_of_the_simulators_record_act_before_their_time(backend: dict, late: int, tmp_path: Path) -> None:
+    from mpc_sgft.storage.episode_file import EpisodeWriter
+
+    path, t = tmp_path / "a.mcap", 0.01 * np.arange(1, 21)
+    row = {"step": 0, "time": t[-1], "observation": [0.0], "action": [0.0], "action_sent": [0.0], "reward": 0.0}
+    row |= {"terminated": False, "truncated": False, "success": False}
+    with EpisodeWriter(path, {"joint_names": ["x"], "actuator_names": ["m"], **backend}) as writer:
+        writer.step(row, {"time": t} | {kind: t[:, None] for kind in ("qpos", "qvel", "ctrl", "force")})
+        writer.close({})
+    table = read_table(path)
+    np.testing.assert_allclose(table.columns["time"], t[: 20 - late])
+    for column, first in (("qpos/x", 0), ("qvel/x", 0), ("ctrl/m", late), ("force/m", late)):
+        np.testing.assert_allclose(table.columns[column], t[first : first + 20 - late])
+    assert len(table.notes) == late
+
+
 def test_models_that_do_not_load(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="no such model file"):
         load_plant(tmp_path / "absent.xml")
