@@ -144,7 +144,7 @@ def run(
         residual_model = None if settled(best) else fit_residual_model(setup, best, sizes, rng)
         verdict = reach_verdict(setup, hypotheses, residual_model, rng, tolerance_of(setup, tolerance))
         bar.update(100 - bar.n)
-    notes = [*plant.notes, *(n for e in recorded for n in e.notes)]
+    notes = [*plant.notes, *plant.notes_of_delays(), *(n for e in recorded for n in e.notes)]
     held = verdict.whole if traces else verdict.best
     left = residual_model and residual_model.error
     fitted = setup.problem.replayer

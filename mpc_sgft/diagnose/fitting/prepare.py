@@ -341,8 +341,12 @@ def typical_sizes(plant: Plant, replayer: Replayer) -> dict[tuple[str, str], Typ
     u = np.concatenate([e.ctrl for e in replayer.episodes])
     pick = np.linspace(0, len(q) - 1, min(200, len(q))).astype(int)
     forces, inertias, peak, needed, touching = [], [], np.zeros(m.nu), np.zeros(m.nv), {}
+    filters, late = (np.flatnonzero(x[: m.nu] > y) for x, y in ((m.actuator_actadr, -1), (m.actuator_history[:, 0], 0)))
     for k in pick:
         data.qpos[:], data.qvel[:], data.ctrl[:] = q[k], v[k], u[k]
+        data.act[m.actuator_actadr[filters]] = u[k][filters]
+        for i in late.tolist():
+            mujoco.mj_initCtrlHistory(m, data, i, None, np.full(m.actuator_history[i, 0], u[k][i]))
         mujoco.mj_forward(m, data)
         full = np.zeros((m.nv, m.nv))
         mujoco.mj_fullM(m, data, full)

@@ -153,6 +153,16 @@ class Plant:
             self.joints, {a: Drive(joint_of(self, a), q) for a, q in zip(self.actuators, asks, strict=True)}, self.bare
         )
 
+    def notes_of_delays(self) -> list[str]:
+        """What must be said of actuators with a delay of their own."""
+        late = [a for i, a in enumerate(self.actuators) if self.model.actuator_delay[i] > 0]
+        if not late:
+            return []
+        return [
+            f"{', '.join(late)}: the model delays its command, and what is on its way at the start of a window is not "
+            "simulated. Leave the delay out of the model (delay=0), and it is found as actuator_delay"
+        ]
+
     def sensors(self) -> list[str]:
         """Sensors of the scene itself that give one number."""
         m = self.model

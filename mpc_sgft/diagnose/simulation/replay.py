@@ -241,9 +241,10 @@ class Replayer:
             inputs[k, :, :, order] = np.moveaxis(self._step_commands(change, pick), -1, 0)
         if force is not None:
             inputs[..., m.nu + vadr] = force
-        for column, name in zip(order, self.plant.actuators, strict=True):
-            if (filtered := m.actuator_actadr[m.actuator(name).id]) >= 0:
-                state[:, :, 1 + m.nq + m.nv + filtered] = inputs[:, :, 0, column]
+        filters = [i for i, column in enumerate(order) if m.actuator_actadr[column] >= 0]
+        if filters:
+            at = 1 + m.nq + m.nv + m.actuator_actadr[np.array(order)[filters]]
+            state[:, :, at] = self._activations(m, changes, pick)[..., filters]
         rows = len(models) * count
         starts, driven = state.reshape(rows, -1), inputs.reshape(rows, self.steps, -1)
         control = CTRL if force is None else FORCED
@@ -264,6 +265,13 @@ class Replayer:
         states, sensed = go(driven)
         shape = (len(models), count, self.steps, -1)
         return inputs, states.reshape(shape), sensed.reshape(shape)
+
+    def _activations(self, m: mujoco.MjModel, changes: list[Change], pick: Index) -> Array:
+        """What filters of actuators have made of the commands up to the windows' starts, [K, W, nu]."""
+        own = np.array([m.actuator_dynprm[m.actuator(a).id, 0] for a in self.plant.actuators])
+        own *= [m.actuator_actadr[m.actuator(a).id] >= 0 for a in self.plant.actuators]
+        edges = self.step_times()[pick, :1, None] + np.array(windows.AFTER)
+        return np.stack([self._mean_commands(replace(c, lag=c.lag + own), pick, edges)[:, 0] for c in changes])
 
     def _start(self, joint: int, late: float, pick: Index) -> Array:
         """True position, velocity and acceleration of a joint at the windows' starts, [3, W], if readings are old."""

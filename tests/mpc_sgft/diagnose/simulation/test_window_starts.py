@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import mujoco
 import numpy as np
+import pytest
 
 from mpc_sgft.diagnose.candidates.effect_table import TypicalSizes
 from mpc_sgft.diagnose.candidates.library import make_term
 from mpc_sgft.diagnose.data.measured import Episode
+from mpc_sgft.diagnose.fitting.prepare import typical_sizes
 from mpc_sgft.diagnose.simulation.plant import Change, Plant
 from mpc_sgft.diagnose.simulation.replay import Replayer
 
@@ -54,3 +56,25 @@ def test_bristles_come_to_the_window_as_the_motion_before_bent_them() -> None:
     lugre = make_term(plant, "stribeck_friction", "x", TypicalSizes()).build(numbers)
     led, guessed = _window_errors(plant, lugre, 2 * np.cos(3 * 0.002 * np.arange(3000)))
     assert np.median(led) < 1e-3 and led.mean() < 0.4 * guessed.mean()
+
+
+FILTER = 'general name="motor" joint="x" dyntype="filterexact" dynprm="0.1"'
+DELAY = 'general name="motor" joint="x" delay="0.05" nsample="30"'
+
+
+def test_a_window_begins_with_what_a_filter_made_of_the_commands_before() -> None:
+    plant = Plant(mujoco.MjSpec.from_string(SLIDE.format(0).replace('motor name="motor" joint="x"', FILTER)))
+    u = 4 * np.sign(np.cos(3 * 0.002 * np.arange(3000)))
+    errors, _ = _window_errors(plant, Change(), u)
+    assert errors[1:].max() < 1e-3  # the first one began with the recording, at rest
+
+
+@pytest.mark.parametrize("actuator", [FILTER, DELAY])
+def test_a_filter_and_a_delay_leave_an_actuator_its_force(actuator: str) -> None:
+    plant = Plant(mujoco.MjSpec.from_string(SLIDE.format(0).replace('motor name="motor" joint="x"', actuator)))
+    t = 0.002 * np.arange(1000)
+    episode = Episode("a", 0.002, 4 * np.cos(3 * t)[:, None], {"qpos/x": 0.1 * np.cos(3 * t)})
+    sizes = typical_sizes(plant, Replayer(plant, [episode], 0.3, ["qpos/x"]))
+    assert sizes["actuator", "motor"].peak == pytest.approx(4, rel=0.01)
+    told = plant.notes_of_delays()
+    assert not told if actuator == FILTER else told[0].startswith("motor: the model delays its command")
