@@ -29,8 +29,11 @@ def configure(*overrides: str, command: str = "deploy") -> DictConfig:
 
 
 def make_env(cfg: DictConfig, num_envs: int = 1) -> ControlEnv:
-    """The task in simulation with the effects of `gap=`, N copies stepped together; a TorchRL environment."""
-    return build.make_env(cfg, num_envs)
+    """The task in simulation, N copies stepped together; a TorchRL environment.
+
+    It has the effects of `gap=`, and where the command draws (pretrain, evaluate) each episode those of `randomize=`.
+    """
+    return build.make_env(cfg, num_envs, randomised=cfg.command != "deploy")
 
 
 def load_agent(cfg: DictConfig) -> Agent:
@@ -52,6 +55,6 @@ def plan(cfg: DictConfig, agent: Agent, observation: torch.Tensor, seed: int = 0
 
 def measure(cfg: DictConfig, agent: Agent, episodes: int = 20, seed: int = 0) -> Score:
     """Success and return of an agent that plans, over episodes with fixed seeds."""
-    env = build.make_env(cfg, episodes)
+    env = make_env(cfg, episodes)
     planner = build.make_planner(cfg, env.action_dim)
     return score(collect(env, planner_policy(agent.model, planner, seed), seed=seed))

@@ -123,7 +123,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     take = commands.add_parser("record", help="guide the hand, keep pictures and poses")
     take.add_argument("--robot-ip", required=True, help="of the robot's controller")
     take.add_argument("--serial", required=True, help="of the camera")
-    take.add_argument("--out", type=Path, required=True, help="new folder of the pairs")
+    take.add_argument("--out", type=Path, required=True, help="folder of the pairs; one of before goes on")
     take.add_argument("--recording", type=Path, help="a .db3 file in place of the camera")
     find = commands.add_parser("solve", help="compute the calibration file")
     find.add_argument("pairs", type=Path, help=f"folder with {NAME}")

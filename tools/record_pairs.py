@@ -20,14 +20,14 @@ ASK = "pair {}: guide the hand, let go, press Enter (q and Enter: finish) "
 
 
 def record(robot_ip: str, serial: str, folder: Path, recording: Path | None = None) -> None:
-    """Ask for places until the user has finished; pairs.json is complete after each.
+    """Ask for places until the user has finished; pairs.json is complete after each, and a folder of before goes on.
 
     Raises:
-        UserError: If the robot does not answer, the folder holds something, or franky is not installed.
+        UserError: If the robot does not answer (any more), the folder holds something else or pairs of another camera,
+            or franky is not installed.
         PerceptionError: If the camera cannot be used.
     """
-    if folder.exists() and any(folder.iterdir()):
-        raise UserError(f"{folder} is not empty; give a new folder with --out.")
+    pairs = _before(folder, serial)
     try:
         franky = import_module("franky")
     except ModuleNotFoundError:
@@ -40,9 +40,14 @@ def record(robot_ip: str, serial: str, folder: Path, recording: Path | None = No
             raise UserError(
                 f"the robot at {robot_ip} does not answer: {str(err).rstrip('.')}. Is it on, unlocked, and FCI active?"
             ) from err
-        pairs: list[dict] = []
         while input(ASK.format(len(pairs))).strip().lower() != "q":
-            state = robot.state
+            try:
+                state = robot.state
+            except franky.Exception as err:
+                raise UserError(
+                    f"the robot at {robot_ip} does not answer any more: {str(err).rstrip('.')}. {len(pairs)} pairs are "
+                    f"in {folder}; the same command goes on there."
+                ) from err
             if np.abs(state.dq).max() > AT_REST:
                 print("the robot moves; wait until it rests")
                 continue
@@ -56,6 +61,21 @@ def record(robot_ip: str, serial: str, folder: Path, recording: Path | None = No
         print()
     finally:
         camera.close()
+
+
+def _before(folder: Path, serial: str) -> list[dict]:
+    """Pairs that were recorded in a folder before."""
+    if not folder.exists() or not any(folder.iterdir()):
+        return []
+    try:
+        whole = json.loads((folder / "pairs.json").read_text())
+        pairs = whole["pairs"] if whole["serial"] == serial else None
+    except (FileNotFoundError, ValueError, KeyError, TypeError) as err:
+        raise UserError(f"{folder} is not empty, and no folder of pairs; give a new one with --out.") from err
+    if pairs is None:
+        raise UserError(f"{folder} holds pairs of camera {whole['serial']}; give a new folder with --out.")
+    print(f"{len(pairs)} pairs are there; going on")
+    return pairs
 
 
 def _fresh(camera: RealSense) -> Frame:

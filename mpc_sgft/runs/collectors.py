@@ -76,7 +76,7 @@ class Process(AbstractCollector):
 
     def start(self, order: Round) -> None:
         blob, self._found = pickle.dumps(order), None
-        with _alive():
+        with _alive(), _without_interrupts():  # a process that starts here keeps them off until it ignores them
             self._coming = [pool.submit(_collect, blob) for pool in self._pools]
 
     def result(self) -> Collected:
@@ -105,6 +105,16 @@ def _alive() -> Iterator[None]:
             "a collecting process ended (out of memory? see above). What was saved is there: go on with --resume "
             "RUN_FOLDER, and collector=inline to collect in one process."
         ) from error
+
+
+@contextmanager
+def _without_interrupts() -> Iterator[None]:
+    """Ctrl-C waits until the end; what is started meanwhile does not hear it at all."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 _explorer: Explorer  # of a collecting process

@@ -20,6 +20,7 @@ from mpc_sgft.learning.agent import Agent
 from mpc_sgft.learning.audit import audit, write_audit
 from mpc_sgft.learning.observation_map import Sensed
 from mpc_sgft.learning.transfer import Transfer, open_loop_error
+from mpc_sgft.learning.world_model import WorldModel
 from mpc_sgft.runs import build, robot
 from mpc_sgft.runs.collect import Score, collect, planner_policy, score, score_of
 from mpc_sgft.runs.explore import explored
@@ -219,10 +220,7 @@ class Deployment:
                 self.operator.enter("ending", number)  # keys are about it
                 return from_episode(episode, number)
             path.rename(path.with_suffix(".empty.mcap"))  # the robot never moved
-        planner = self.planner
-        if number <= cfg.warmup:
-            planner = self.warm_up
-        model = self.transfer.pretrained if number <= cfg.warmup else self.transfer.acting
+        model, planner = self._driver(number), self.warm_up if number <= cfg.warmup else self.planner
         seed = start_seed(cfg.seed, number)
         self.operator.rest()
         if self.operator.stopping or self.stop.asked:
@@ -252,6 +250,10 @@ class Deployment:
             self._break_off(number)
             raise
 
+    def _driver(self, number: int) -> WorldModel:
+        """The model that drives a rollout."""
+        return self.transfer.pretrained if number <= self.cfg.warmup else self.transfer.acting
+
     def _break_off(self, number: int) -> None:
         """Bring the machine to rest before a rollout is done, and keep what was said of the one before."""
         try:
@@ -275,7 +277,7 @@ class Deployment:
 
     def _measure(self, rollout: Rollout, number: int) -> dict[str, float]:
         """Model error and improvability of a rollout under the model that drove it, and its view in rerun."""
-        model, horizon = self.transfer.acting, self.cfg.planner.horizon
+        model, horizon = self._driver(number), self.cfg.planner.horizon
         error = open_loop_error(model, rollout.steps, horizon)
         found = audit(model, rollout.steps, self.cfg.task.discount, seed=number)
         forget_audit(self.folder / "audit.csv", number)  # a process that was killed while it learned had written it

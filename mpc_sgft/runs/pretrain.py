@@ -27,7 +27,7 @@ from mpc_sgft.storage import checkpoint, run_folder
 from mpc_sgft.storage.metrics import MetricLogger, progress
 from planners.policy import PolicyPlanner
 
-EVAL_SEED = 1_000_000  # evaluation episodes never share a seed with collected ones
+EVAL_SEED = 1_000_000  # of evaluation episodes: far from what a pretraining with seed=0 collects
 
 
 def pretrain(cfg: DictConfig) -> int:
@@ -46,10 +46,8 @@ def pretrain(cfg: DictConfig) -> int:
     state = {"round": 0, "updates": 0, "transitions": 0, "episodes": 0, "seconds": 0.0, "streak": 0, "unstable": 0}
     watch = Stopwatch("wait", "update", "evaluate", "save")
     saved = folder / "checkpoint" / "state.pt"
-    if cfg.resume is not None:
-        if not saved.is_file():
-            raise UserError(f"{folder} holds no checkpoint yet: nothing to resume. Start it again with run_dir=...")
-        stored = build.load_state(saved)
+    stored = build.load_state(saved) if cfg.resume is not None and saved.is_file() else None
+    if stored is not None:
         state, watch.spent = stored["loop"], stored["spent"]
         agent.load_state_dict(stored["agent"])
         agent.averaged.value_range = float(agent.scale.value)
@@ -92,8 +90,10 @@ def pretrain(cfg: DictConfig) -> int:
     bar = progress(cfg.transitions, initial=state["transitions"], desc="pretrain", disable=cfg.quiet)
     result, began = None, time.monotonic() - state["seconds"]
     order, ahead = plan_round(0), None
-    if cfg.resume is not None:
+    if stored is not None:
         order, ahead = Round(*stored["order"]), stored["ahead"] and Collected.of(stored["ahead"])
+    elif cfg.resume is not None:
+        print(f"{folder} stopped before it saved anything: it begins again")
     if finished():
         print(
             f"{folder} is finished: only its final evaluation is made. More training: transitions=N min_transitions=N"
@@ -183,7 +183,7 @@ def start_buffer(cfg: DictConfig, device: torch.device, episode_steps: int) -> S
     """An empty replay buffer.
 
     Raises:
-        UserError: If it cannot hold a round, or no episode holds one of its slices.
+        UserError: If it cannot hold a round, or no episode holds one of its slices, or its rows are not of a round.
     """
     replay, steps = cfg.train.replay, cfg.num_envs * episode_steps
     if steps > replay.capacity:
@@ -193,6 +193,11 @@ def start_buffer(cfg: DictConfig, device: torch.device, episode_steps: int) -> S
         )
     if not 1 <= replay.slice_len <= episode_steps:
         raise UserError(f"train.replay.slice_len={replay.slice_len}: an episode has 1 to {episode_steps} steps.")
+    if cfg.train.privileged and replay.slice_len != episode_steps:
+        raise UserError(
+            f"train.replay.slice_len={replay.slice_len}: train={cfg.chosen.train} learns from rows of whole episodes, "
+            f"{episode_steps} steps. Leave it out."
+        )
     return instantiate(replay, seed=cfg.seed, device=device)
 
 

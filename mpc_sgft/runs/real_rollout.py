@@ -16,7 +16,7 @@ from mpc_sgft.storage.episode_file import EpisodeWriter
 from mpc_sgft.storage.rollout import Rollout
 from planners.base import Plan
 
-REAL_SEED = 2_000_000  # real rollouts never share a seed with evaluation or pretraining
+REAL_SEED = 2_000_000  # of real rollouts: far from evaluation, and from what a pretraining with seed=0 collects
 
 
 def start_seed(seed: int, number: int) -> int:

@@ -77,16 +77,42 @@ def test_each_pair_is_a_new_picture_and_where_the_hand_was(
     assert numbers == sorted(set(numbers)), numbers
 
 
-def test_an_end_of_input_keeps_what_there_is(record, stand_in: StandIn, tmp_path, capsys) -> None:
-    assert record(stand_in.ip, tmp_path / "pairs", "\n") == 0
+def test_what_is_there_is_kept_and_goes_on(record, stand_in: StandIn, tmp_path, capsys) -> None:
+    file = tmp_path / "pairs" / "pairs.json"
+    assert record(stand_in.ip, tmp_path / "pairs", "\n") == 0  # the input ended
+    first = json.loads(file.read_text())["pairs"]
+    assert record(stand_in.ip, tmp_path / "pairs", "\nq\n") == 0
+    assert "1 pairs are there" in capsys.readouterr().out
+    pairs = json.loads(file.read_text())["pairs"]
+    assert pairs[:1] == first and [pair["image"] for pair in pairs] == ["00.png", "01.png"]
+
+
+def test_a_robot_that_is_lost_costs_no_pair(record, robot_push: Push, tmp_path, monkeypatch, capsys) -> None:
+    lost = StandIn(robot_push)
+    keys = iter(["", "", "q"])
+
+    def typed(ask: str) -> str:
+        if "pair 1" in ask:
+            lost.close()
+        return next(keys)
+
+    monkeypatch.setattr("builtins.input", typed)
+    try:
+        assert record(lost.ip, tmp_path / "pairs", "") == 2
+    finally:
+        lost.close()
+    assert "does not answer any more" in capsys.readouterr().err
     assert len(json.loads((tmp_path / "pairs" / "pairs.json").read_text())["pairs"]) == 1
 
 
 def test_what_is_wrong_is_one_line_and_nothing_is_overwritten(record, tmp_path, capsys) -> None:
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "pairs.json").write_text("mine")
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "pairs.json").write_text('{"serial": "78", "pairs": []}')
     for ip, folder, words in (
         ("127.77.77.77", tmp_path / "full", "is not empty"),
+        ("127.77.77.77", tmp_path / "other", "holds pairs of camera 78"),
         ("127.77.77.77", tmp_path / "new", "127.77.77.77 does not answer"),
     ):
         assert record(ip, folder, "\nq\n") == 2

@@ -14,7 +14,6 @@ from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
-from tensordict import TensorDict
 
 from mpc_sgft.command.errors import UserError
 from mpc_sgft.learning.transfer import Transfer
@@ -24,7 +23,7 @@ from mpc_sgft.runs.deploy import make_transfer
 from mpc_sgft.runs.pretrain import evaluation_seed
 from mpc_sgft.storage.episode_file import read_episode
 from mpc_sgft.storage.metrics import progress
-from mpc_sgft.storage.rollout import from_episode
+from mpc_sgft.storage.rollout import Rollout, from_episode
 
 COLUMNS = ["run", "gap", "settings", "seed", "rollouts", "success", "episodes"]
 
@@ -58,16 +57,13 @@ def config_of(run: Path, settings: list[str], seed: int) -> DictConfig:
     return cfg
 
 
-def rollouts_of(run: Path) -> list[tuple[TensorDict, bool]]:
-    """The valid steps [T] of each recorded rollout, and whether it reached its goal."""
+def rollouts_of(run: Path) -> list[Rollout]:
+    """The recorded rollouts of a run, in their order."""
     files = sorted((run / "episodes").glob("[0-9][0-9][0-9][0-9].mcap"))
-    rollouts = [from_episode(read_episode(file), number) for number, file in enumerate(files, 1)]
-    return [(r.steps[~r.steps["next", "invalid"][:, 0]], r.success) for r in rollouts]
+    return [from_episode(read_episode(file), number) for number, file in enumerate(files, 1)]
 
 
-def relearn(
-    cfg: DictConfig, rollouts: list[tuple[TensorDict, bool]], at: list[int]
-) -> tuple[Transfer, dict[int, float]]:
+def relearn(cfg: DictConfig, rollouts: list[Rollout], at: list[int]) -> tuple[Transfer, dict[int, float]]:
     """Learn from rollouts in their order; returns what was learned, and the success after each number in `at`."""
     build.prepare_process(cfg)
     agent, _ = build.load_agent(cfg)
@@ -76,9 +72,12 @@ def relearn(
     transfer = make_transfer(cfg, agent, build.sensed(cfg), judge.task.episode_steps)
     success = {}
     bar = progress(len(rollouts), initial=0, desc="relearn", unit="rollout", disable=False)
-    for count, (steps, reached) in enumerate(rollouts, 1):
-        if len(steps) >= transfer.slice_len:
-            transfer.learn(steps, success=reached)
+    for count, rollout in enumerate(rollouts, 1):
+        valid = rollout.steps[~rollout.steps["next", "invalid"][:, 0]]
+        if len(valid) >= transfer.slice_len and not rollout.intervened:
+            transfer.learn(valid, success=rollout.success, warm_up=count <= cfg.warmup)
+        else:
+            transfer.interrupt()
         bar.update(1)
         if count in at:
             seed = evaluation_seed(cfg)

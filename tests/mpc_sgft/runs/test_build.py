@@ -2,7 +2,7 @@
 
 import pytest
 
-from mpc_sgft.api import configure, measure
+from mpc_sgft.api import configure, make_env, measure
 from mpc_sgft.command import compose
 from mpc_sgft.command.errors import UserError
 from mpc_sgft.runs import build
@@ -54,3 +54,14 @@ def test_a_draw_that_is_null_is_left_out() -> None:
 def test_a_config_from_python_has_only_words_that_exist(word: str, command: str) -> None:
     with pytest.raises(UserError, match=f"unknown {word.partition('=')[0]}"):
         configure(word, command=command)
+
+
+def test_from_python_environments_draw_what_the_command_draws() -> None:
+    def drawn(*words: str, command: str) -> int:
+        env = make_env(configure("task=push", *words, command=command), 3)
+        env.set_seed(0)
+        env.reset()
+        return len({tuple(row) for row in env.backend.randomizer.places.tolist()})
+
+    assert drawn("randomize=push", command="evaluate") == drawn(command="pretrain") == 3
+    assert drawn(command="evaluate") == drawn(command="deploy") == 1

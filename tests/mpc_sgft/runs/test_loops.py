@@ -20,13 +20,14 @@ from safetensors.torch import load_file
 
 from mpc_sgft import deploy, evaluate, pretrain
 from mpc_sgft.command.errors import UserError
-from mpc_sgft.learning.transfer import Transfer
+from mpc_sgft.learning.transfer import Transfer, open_loop_error
 from mpc_sgft.runs import evaluate as evaluating
 from mpc_sgft.runs import pretrain as pretraining
 from mpc_sgft.runs.collect import planner_policy
 from mpc_sgft.runs.real_rollout import drive
 from mpc_sgft.storage import checkpoint
 from mpc_sgft.storage.episode_file import read_episode
+from mpc_sgft.storage.rollout import from_episode
 from mpc_sgft.views.deploy_view import DeployViewer
 from tests.mpc_sgft.views.test_viewer import columns
 from tools.studies import relearn
@@ -99,6 +100,17 @@ def test_pretraining_resumes_with_the_same_numbers(pretrained, tmp_path):
     assert run("pretrain", "--resume", str(half), "transitions=2400").returncode == 0
     model = checkpoint.load(half / "checkpoint" / "model.safetensors").model
     assert model.value_range == pytest.approx(float(rows(half)[-1]["scale"])) and model.value_range > 1.1
+
+
+def test_a_run_that_stopped_before_it_saved_begins_again(pretrained, tmp_path):
+    (tmp_path / "r").mkdir()
+    for name in ("config.yaml", "metrics.csv"):  # rows of rounds that no checkpoint holds
+        shutil.copy(pretrained / name, tmp_path / "r" / name)
+    done = here("pretrain", "--resume", str(tmp_path / "r"))
+    assert done.returncode == 0 and "begins again" in done.stdout, done.stderr
+    weights, again = (load_file(f / "checkpoint" / "model.safetensors") for f in (pretrained, tmp_path / "r"))
+    assert all((weights[k] == again[k]).all() for k in weights)
+    assert [r["updates"] for r in rows(tmp_path / "r")] == [r["updates"] for r in rows(pretrained)]
 
 
 def test_a_final_evaluation_that_was_left_plans_with_the_range_of_what_was_learned(tmp_path, monkeypatch):
@@ -225,6 +237,14 @@ def test_the_simulation_policy_drives_the_warm_up_and_the_planner_the_rest(pretr
         with torch.no_grad():
             wanted = model.policy_prior(model.encode(torch.as_tensor(episode["observation"]).float()), None)
         assert torch.allclose(wanted, torch.as_tensor(episode["action"]).float(), atol=1e-4) is by_policy
+
+
+def test_a_warm_up_is_measured_by_the_model_that_drove_it(pretrained, tmp_path):
+    words = ["gap=pendulum_torque", "rollouts=2", "warmup=2", "eval_every=2", "method.updates=25", "method.gate=false"]
+    assert here("deploy", f"checkpoint={pretrained}", f"run_dir={tmp_path / 'r'}", *words).returncode == 0
+    steps = from_episode(read_episode(tmp_path / "r" / "episodes" / "0002.mcap"), 2).steps
+    wanted = open_loop_error(checkpoint.load(pretrained).model, steps, 4)[:, 0].nanmean()
+    assert float(rows(tmp_path / "r")[1]["model_error_1"]) == pytest.approx(float(wanted), rel=1e-3)
 
 
 def test_a_killed_deployment_loses_at_most_the_step_in_flight(pretrained, tmp_path):

@@ -1,5 +1,9 @@
 """How pretraining explores, and what it may start from."""
 
+import os
+import signal
+import time
+
 import numpy as np
 import pytest
 import torch
@@ -158,6 +162,25 @@ def test_a_collecting_process_that_dies_is_named():
     with pytest.raises(UserError, match="a collecting process ended.*--resume"):
         collector.start(Round(1, None))
         collector.result()
+
+
+def test_rows_that_are_no_whole_episodes_are_refused():
+    cfg = compose.compose("pretrain", ["task=push", "train=recurrent_dr", "train.replay.slice_len=5"], [])
+    with pytest.raises(UserError, match="slice_len=5: train=recurrent_dr learns from rows of whole episodes, 40 steps"):
+        pretrain.start_buffer(cfg, torch.device("cpu"), 40)
+
+
+def test_ctrl_c_ends_no_collecting_process_that_is_starting():
+    cfg = config(num_envs=2)
+    collector = Process(cfg, build.make_agent(cfg, build.make_env(cfg, 1)).model.sizes)
+    collector.start(Round(0, None))
+    for process in collector._pools[0]._processes.values():
+        for _ in range(5):  # before Python begins in it, and while it imports
+            os.kill(process.pid, signal.SIGINT)
+            time.sleep(0.2)
+    assert len(collector.result().steps) == 2
+    collector.close()
+    assert not signal.pthread_sigmask(signal.SIG_BLOCK, set()), "Ctrl-C reaches this process again"
 
 
 def test_more_workers_than_environments_are_refused():
