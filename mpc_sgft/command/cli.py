@@ -115,6 +115,13 @@ def _run(command: Command, flags: argparse.Namespace, given: list[str]) -> int:
     if flags.config:
         print(OmegaConf.to_yaml(cfg), end="")
         return 0
+    return _start(command, cfg)
+
+
+def _start(command: Command, cfg: DictConfig) -> int:
+    from mpc_sgft.command.address import check_address
+
+    check_address(cfg)
     return int(_loop(command)(cfg) or 0)
 
 
@@ -134,7 +141,7 @@ def _sweep(command: Command, overrides: list[str]) -> int:
     name = command.name
 
     def job(cfg: DictConfig) -> int:
-        return int(_loop(command)(compose.complete_job(cfg, name)) or 0)
+        return _start(command, compose.complete_job(cfg, name))
 
     hydra_settings = ["hydra/job_logging=stdout", f"hydra.job.name={name}"]
     argv, full_error = sys.argv, os.environ.get("HYDRA_FULL_ERROR")

@@ -36,8 +36,9 @@ def dtype_of_products(precision: str, width: int, device: torch.device) -> torch
 @cache
 def _warn_once() -> None:
     warnings.warn(
-        "precision=bfloat16: this processor has no bfloat16 products. Numbers are rounded as if it had, which takes no "
-        "less time than float32. Use precision=auto or float32.",
+        "precision=bfloat16: this processor has no bfloat16 products. Numbers are rounded as if it had, and take, as "
+        "measured, 1.0 to 1.2 times as long as float32 with the 1M model and up to 1.7 times with the small one. Use "
+        "precision=auto or float32.",
         stacklevel=3,
     )
 

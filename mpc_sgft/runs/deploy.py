@@ -22,7 +22,7 @@ from mpc_sgft.learning.observation_map import Sensed
 from mpc_sgft.learning.transfer import Transfer, open_loop_error
 from mpc_sgft.learning.world_model import WorldModel
 from mpc_sgft.runs import build, robot
-from mpc_sgft.runs.collect import Score, collect, planner_policy, score, score_of
+from mpc_sgft.runs.collect import Score, collect, planner_policy, score, score_of, shown
 from mpc_sgft.runs.explore import explored
 from mpc_sgft.runs.pretrain import StopRequest, Stopwatch, evaluation_seed
 from mpc_sgft.runs.real_rollout import begin, drive, start_seed
@@ -140,9 +140,6 @@ class Deployment:
     def loop(self) -> dict[str, Any]:
         """Run what is left, and write the summary."""
         cfg, table = self.cfg, None if self.cfg.quiet else GrowingTable()
-        if self.judge and not self.state["scores"]:
-            self.evaluate(table, {})
-            self.save()
         if self.viewer:
             self.viewer.value_map("before", self.transfer.pretrained)
         hidden = cfg.quiet or self.operator.present  # the page shows the same
@@ -161,6 +158,7 @@ class Deployment:
                 raise Stopped(self.how_to_go_on())  # what was recorded counts when the session goes on
             if rollout is None:
                 continue
+            self._before(table)
             self._count(rollout, number, table)
             self.operator.rest()
             self.verdicts.late(number)
@@ -169,8 +167,15 @@ class Deployment:
             bar.set_postfix({"real_success": f"{self.state['successes']}/{self.state['rollouts']}"} | paused)
             if self.stop.asked or self.operator.stopping:
                 raise Stopped(self.how_to_go_on())
+        self._before(table)  # without any rollout
         bar.close()
         return self._finish()
+
+    def _before(self, table: GrowingTable | None) -> None:
+        """Measure what was pretrained, once, before anything is learned; the first rollout need not wait for it."""
+        if self.judge and not self.state["scores"]:
+            self.evaluate(table, {})
+            self.save()
 
     def _count(self, rollout: Rollout, number: int, table: GrowingTable | None) -> None:
         """Measure a rollout, learn from it unless a person had the arm or what wins stays, and save."""
@@ -319,7 +324,9 @@ class Deployment:
             latest = self.state["outcomes"][max(self.state["scores"], default=0) :]
             return score_of(*zip(*latest, strict=True))
         seed = evaluation_seed(self.cfg)
-        return score(collect(self.judge, planner_policy(self.transfer.acting, self.planner, seed), seed=seed))
+        act, hidden = planner_policy(self.transfer.acting, self.planner, seed), self.cfg.quiet or self.operator.present
+        with progress(self.judge.task.episode_steps, desc="evaluate", disable=hidden, leave=False) as bar:
+            return score(collect(self.judge, shown(act, bar), seed=seed))
 
     def save(self) -> None:
         """Weights and exact state."""

@@ -1,5 +1,6 @@
 """A round of exploration in simulation, as a function of its number and of the policy: the same wherever it runs."""
 
+import time
 from collections.abc import Mapping
 from contextlib import closing
 from typing import Any, NamedTuple
@@ -37,6 +38,7 @@ class Collected(NamedTuple):
     unstable: int  # episodes that the simulator had to give up
     places: Tensor  # where in its range each draw lay, [N, D]; nan where the episode says nothing about the policy
     shapes: tuple[tuple[float, float], ...] | None  # what these places were drawn from
+    seconds: dict[str, float]  # that the workers' physics, and their policies, took together
 
     def state_dict(self) -> dict[str, Any]:
         """As nested dicts of tensors and numbers, for `Collected.of`."""
@@ -47,7 +49,8 @@ class Collected(NamedTuple):
     def of(cls, state: Mapping[str, Any]) -> "Collected":
         """What `state_dict` wrote down."""
         steps = TensorDict(state["steps"], state["size"]).unflatten_keys(".")
-        return cls(steps, state["unstable"], state["places"], state["shapes"])
+        seconds = state.get("seconds", {})  # runs of before did not count them
+        return cls(steps, state["unstable"], state["places"], state["shapes"], seconds)
 
 
 def policy_weights(model: WorldModel) -> dict[str, Tensor]:
@@ -83,12 +86,27 @@ class Explorer:
         else:
             self.model.load_state_dict(order.weights, strict=False)
             act = explorer(self.model, self.cfg, self.env.batch_size[0], seed)
+        began, acting = time.monotonic(), [0.0]
+        act = _timed(act, acting)
         steps = collect(self.env, shown(act, bar) if bar is not None else act, seed=seed)
+        seconds = {"act": acting[0], "physics": time.monotonic() - began - acting[0]}
         places = torch.from_numpy(randomizer.places.copy())
         roaming = len(places) if order.weights is None else int(self.cfg.detours.share * len(places))
         places[:roaming] = torch.nan
         places[steps["episode"][:, 0] != steps["episode"][:, -1]] = torch.nan  # drawn anew since
-        return Collected(steps, self.env.backend.counters["unstable"] - before, places, order.shapes)
+        return Collected(steps, self.env.backend.counters["unstable"] - before, places, order.shapes, seconds)
+
+
+def _timed(act: Act, total: list[float]) -> Act:
+    """The same policy; its seconds are added to the one number in `total`."""
+
+    def timed(observation: Tensor, fresh: Tensor) -> Tensor:
+        began = time.monotonic()
+        action = act(observation, fresh)
+        total[0] += time.monotonic() - began
+        return action
+
+    return timed
 
 
 def explored(cfg: DictConfig, model: WorldModel, episodes: int) -> TensorDict:
@@ -124,7 +142,8 @@ def joined(collected: list[Collected]) -> Collected:
         found.steps["episode"] += following
         following = int(found.steps["episode"].max()) + 1
     steps, places = torch.cat([c.steps for c in collected]), torch.cat([c.places for c in collected])
-    return Collected(steps, sum(c.unstable for c in collected), places, collected[0].shapes)
+    seconds = {part: sum(c.seconds[part] for c in collected) for part in collected[0].seconds}
+    return Collected(steps, sum(c.unstable for c in collected), places, collected[0].shapes, seconds)
 
 
 def explorer(model: WorldModel, cfg: DictConfig, num_envs: int, seed: int) -> Act:

@@ -44,11 +44,11 @@ def pretrain(cfg: DictConfig) -> int:
     planner = build.make_planner(cfg, judge.action_dim)  # what is wrong with it shows now, not after hours
     buffer = start_buffer(cfg, agent.device, judge.task.episode_steps)
     state = {"round": 0, "updates": 0, "transitions": 0, "episodes": 0, "seconds": 0.0, "streak": 0, "unstable": 0}
-    watch = Stopwatch("wait", "update", "evaluate", "save")
+    watch = Stopwatch("wait", "update", "evaluate", "save", "act", "physics")  # the last two are the collectors' own
     saved = folder / "checkpoint" / "state.pt"
     stored = build.load_state(saved) if cfg.resume is not None and saved.is_file() else None
     if stored is not None:
-        state, watch.spent = stored["loop"], stored["spent"]
+        state, watch.spent = stored["loop"], watch.spent | stored["spent"]
         agent.load_state_dict(stored["agent"])
         agent.averaged.value_range = float(agent.scale.value)
         buffer.load_state_dict(stored["buffer"])
@@ -110,6 +110,8 @@ def pretrain(cfg: DictConfig) -> int:
         state["transitions"] += data.numel()
         state["episodes"] = int(data["episode"].max()) + 1
         state["unstable"] += found.unstable
+        for part, seconds in found.seconds.items():
+            watch.spent[part] += seconds
         widened = curriculum.record(found.places, succeeded(data), found.shapes) if curriculum and found.shapes else {}
         order = plan_round(state["round"] + 1)
         if state["transitions"] < cfg.transitions:

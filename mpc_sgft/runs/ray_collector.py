@@ -5,26 +5,30 @@ share is a function of its number and of the policy, so that the numbers are the
 TorchRL's RayCollector is not used because it ends the run when a worker dies.
 """
 
+import hashlib
 import logging
 import pickle
 import platform
-import socket
 import subprocess
 import sys
+from functools import cached_property
 from importlib.metadata import version
+from pathlib import Path
 
 import torch
 from omegaconf import DictConfig
 
+import mpc_sgft
 from mpc_sgft.command.errors import UserError
 from mpc_sgft.runs.collectors import AbstractCollector, check_workers
 from mpc_sgft.runs.explore import Collected, Explorer, Round, joined
 
-ANSWER, JOINED = 10.0, 40.0  # [s] within which a cluster must accept a connection, and let somebody join
+JOINED = 40.0  # [s] within which a cluster must let somebody join
 TOKEN_SAYS = "If it asks for a token, this machine needs that of its head as ~/.ray/auth_token."
 JOIN = "import ray, sys; ray.init(address=sys.argv[1], log_to_driver=False)"
 STORE = 256 * 2**20  # bytes of shared memory of a cluster that is started here
-MUST_AGREE = ("mpc_sgft", "torch", "mujoco")
+MUST_AGREE, OURS = ("mpc_sgft", "torch", "mujoco"), ("mpc_sgft", "envs", "planners")
+ROOT = Path(mpc_sgft.__file__).parents[1]
 
 
 class Ray(AbstractCollector):
@@ -48,8 +52,7 @@ class Ray(AbstractCollector):
         check_workers(workers, cfg.num_envs)
         if address is not None:
             _use_token()
-        if address is not None and address != "auto":
-            _check_answers(address)
+            _try(address)
         here = {"num_cpus": workers, "include_dashboard": False, "object_store_memory": STORE}
         try:
             ray.init(
@@ -98,23 +101,36 @@ class Ray(AbstractCollector):
 
     def _check_versions(self) -> None:
         ours = versions()
-        for name, theirs in self._ray.get([worker.versions.remote() for worker in self._workers]):
+        try:
+            found = self._ray.get([worker.versions.remote() for worker in self._workers])
+        except self._ray.exceptions.RayError as error:  # its text names the machine
+            self.close()
+            says = " ".join(str(error).split())[-300:].rstrip(".")
+            raise UserError(f"a worker cannot start: {says}. Is mpc_sgft installed there as here?") from error
+        for name, theirs in found:
             if theirs != ours:
                 self.close()
                 raise UserError(f"the worker on {name} has {theirs}, this process {ours}: install the same there.")
 
 
 def versions() -> dict[str, str]:
-    """Versions that must be the same wherever rounds are collected."""
-    return {name: version(name) for name in MUST_AGREE}
+    """What must be the same wherever rounds are collected: versions, and a digest of our own code."""
+    own = hashlib.sha256()
+    for file in sorted(file for package in OURS for file in (ROOT / package).rglob("*.py")):
+        own.update(str(file.relative_to(ROOT)).encode() + file.read_bytes())
+    return {name: version(name) for name in MUST_AGREE} | {"code": own.hexdigest()[:12]}
 
 
 class _Worker:
-    """What runs on the cluster."""
+    """What runs on the cluster; nothing is built before its versions were asked."""
 
     def __init__(self, blob: bytes) -> None:
         torch.set_num_threads(1)
-        self._explorer = Explorer(*pickle.loads(blob), threads=1)
+        self._blob = blob
+
+    @cached_property
+    def _explorer(self) -> Explorer:
+        return Explorer(*pickle.loads(self._blob), threads=1)
 
     def versions(self) -> tuple[str, dict[str, str]]:
         return platform.node(), versions()
@@ -132,22 +148,18 @@ def _use_token() -> None:
     authentication_token_setup.maybe_enable_token_auth_if_token_available(warn_if_disabled=False)
 
 
-def _check_answers(address: str) -> None:
-    """Raise UserError unless a cluster answers there soon; Ray itself tries for longer than a minute."""
-    host, _, port = address.removeprefix("ray://").rpartition(":")
-    if not host or not port.isdigit():
-        raise UserError(f"collector.address={address}: host:port, ray://host:port or auto.")
+def _try(address: str) -> None:
+    """Join a cluster in a process of its own, whose log nobody sees: Ray writes a line a second where it may not.
+
+    Raises:
+        UserError: If it cannot be joined.
+    """
     try:
-        socket.create_connection((host, int(port)), timeout=ANSWER).close()
-    except OSError as error:
-        raise UserError(
-            f"collector.address={address}: nobody answers ({error}). Start a cluster there with ray start --head, or "
-            "leave the address out to start one here."
-        ) from error
-    try:  # what goes wrong in another way, joining it from here says
-        subprocess.run([sys.executable, "-c", JOIN, address], timeout=JOINED, capture_output=True, check=False)
+        done = subprocess.run([sys.executable, "-c", JOIN, address], timeout=JOINED, capture_output=True, text=True)
     except subprocess.TimeoutExpired as error:
         raise UserError(
-            f"collector.address={address}: something answers, but no Ray cluster that could be joined within "
-            f"{JOINED:.0f} s. Give the address that ray start --head printed, or leave it out to start one here."
+            f"collector.address={address}: it cannot be joined within {JOINED:.0f} s. {TOKEN_SAYS}"
         ) from error
+    if done.returncode:
+        lines = done.stderr.strip().splitlines() or [f"exit code {done.returncode}"]
+        raise UserError(f"collector.address={address}: Ray could not join that cluster. {lines[-1]}. {TOKEN_SAYS}")

@@ -1,11 +1,12 @@
 """What more costs: a plan by candidates, horizon, environments and model; start-up times; bytes of a rollout.
 
-    python -m tools.benchmarks.cost_growth [--parts plan start disk] [--repeats 20] [--out CSV]
+    python -m tools.benchmarks.cost_growth [--parts plan start disk thousand] [--repeats 20] [--out CSV]
 
 `plan`: one thread; each row changes one number of the first one, and `ratio` is to that one, measured beside it.
 `start`: seconds until a command has said `--help`, until the libraries under every command are imported, and until a
 deployment has recorded its first rollout; that once more without Python's compiled files, beside it.
 `disk`: bytes that ten more rollouts of push add to run.rrd and to the episodes, a rollout.
+`thousand`: what a run of a thousand rollouts of push takes; its search is a small one, which changes no size.
 """
 
 import argparse
@@ -94,7 +95,7 @@ def first_rollout(**environment: str) -> float:
     """Seconds until a new deployment, with these environment variables, begins its first rollout."""
     with tempfile.TemporaryDirectory() as folder:
         first = Path(folder) / "run" / "episodes" / "0001.mcap"
-        words = ["rollouts=1", "eval_episodes=1", "quiet=true", f"run_dir={folder}/run"]
+        words = ["rollouts=1", "quiet=true", f"run_dir={folder}/run"]
         line, start = [sys.executable, "-m", "mpc_sgft.deploy", *words], time.perf_counter()
         with subprocess.Popen(
             line, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, env=os.environ | environment
@@ -102,24 +103,34 @@ def first_rollout(**environment: str) -> float:
             while not first.exists() and process.poll() is None:
                 time.sleep(0.02)
             took = time.perf_counter() - start
+            if first.exists():  # the rest is not of interest
+                process.kill()
             said = process.stderr.read() if process.stderr else b""
-        if process.returncode:
+        if not first.exists():
             raise RuntimeError(f"deploy ended with {process.returncode}: {said.decode()[-500:]}")
     return took
 
 
 def disk() -> list[dict[str, object]]:
     """Bytes that a rollout adds, from runs of 5 and of 15."""
-    sizes: dict[str, list[int]] = {"run.rrd": [], "episodes": []}
-    for count in (5, 15):
-        with tempfile.TemporaryDirectory() as folder:
-            words = ["method=zero_shot", f"rollouts={count}", "eval_every=1000", "eval_episodes=1", "quiet=true"]
-            line = [sys.executable, "-m", "mpc_sgft.deploy", *words, f"run_dir={folder}/run"]
-            subprocess.run(line, check=True, stdout=subprocess.DEVNULL)
-            run = Path(folder) / "run"
-            sizes["run.rrd"].append((run / "run.rrd").stat().st_size)
-            sizes["episodes"].append(sum(path.stat().st_size for path in (run / "episodes").iterdir()))
-    return [_row("disk", name, "a rollout", (b - a) / 10 / 1e3, "kB") for name, (a, b) in sizes.items()]
+    few, more = sizes(5), sizes(15)
+    return [_row("disk", name, "a rollout", (more[name] - few[name]) / 10 / 1e3, "kB") for name in few]
+
+
+def thousand() -> list[dict[str, object]]:
+    """Bytes of a run of 1000 rollouts."""
+    found = sizes(1000, "planner.num_candidates=64", "planner.iterations=2")
+    return [_row("disk", name, "1000 rollouts", size / 1e6, "MB") for name, size in found.items()]
+
+
+def sizes(rollouts: int, *words: str) -> dict[str, int]:
+    """Bytes of run.rrd and of the episodes of a run that learns nothing."""
+    with tempfile.TemporaryDirectory() as folder:
+        run, few = Path(folder) / "run", ["eval_every=1000", "eval_episodes=1", "quiet=true"]
+        line = [sys.executable, "-m", "mpc_sgft.deploy", "method=zero_shot", f"rollouts={rollouts}", *few, *words]
+        subprocess.run([*line, f"run_dir={run}"], check=True, stdout=subprocess.DEVNULL)
+        episodes = sum(path.stat().st_size for path in (run / "episodes").iterdir())
+        return {"run.rrd": (run / "run.rrd").stat().st_size, "episodes": episodes}
 
 
 def _row(part: str, what: str, value: object, amount: float, unit: str, ratio: float | None = None) -> dict:
@@ -130,6 +141,7 @@ def _row(part: str, what: str, value: object, amount: float, unit: str, ratio: f
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parts = {"plan": lambda n: plans(n), "start": lambda n: starts(max(1, n // 6)), "disk": lambda n: disk()}
+    parts |= {"thousand": lambda n: thousand()}
     parser.add_argument("--parts", nargs="+", default=[*parts], choices=[*parts])
     parser.add_argument("--repeats", type=int, default=20)
     parser.add_argument("--out", type=Path, default=ROOT / "results/scale/cost_growth.csv")

@@ -14,6 +14,7 @@ from tools.studies.runner import each, finished, write
 
 COLUMNS = "task seed transitions updates episodes_evaluated success success_low success_high prior_success".split()
 PARTS = ("update", "wait", "evaluate", "save")  # where the seconds went: learning, waiting for episodes, and so on
+PARTS += ("physics", "act")  # beside them, in the processes that collect
 PROCESSES = ("learner", "collector")  # the most memory that each held; the workers of a Ray cluster are no collector
 COLUMNS += ["wall_seconds", *(f"{part}_seconds" for part in PARTS), *(f"{name}_mb" for name in PROCESSES)]
 

@@ -24,6 +24,7 @@ from mpc_sgft.learning.transfer import Transfer, open_loop_error
 from mpc_sgft.runs import evaluate as evaluating
 from mpc_sgft.runs import pretrain as pretraining
 from mpc_sgft.runs.collect import planner_policy
+from mpc_sgft.runs.deploy import Deployment
 from mpc_sgft.runs.real_rollout import drive
 from mpc_sgft.storage import checkpoint
 from mpc_sgft.storage.episode_file import read_episode
@@ -237,6 +238,23 @@ def test_the_simulation_policy_drives_the_warm_up_and_the_planner_the_rest(pretr
         with torch.no_grad():
             wanted = model.policy_prior(model.encode(torch.as_tensor(episode["observation"]).float()), None)
         assert torch.allclose(wanted, torch.as_tensor(episode["action"]).float(), atol=1e-4) is by_policy
+
+
+def test_the_first_rollout_does_not_wait_for_an_evaluation(pretrained, tmp_path, monkeypatch):
+    """What was pretrained is measured after it was driven once, before it learns."""
+    seen, evaluate = [], Deployment.evaluate
+
+    def watched(self, *rest):
+        seen.append((self.path(1).exists(), self.state["rollouts"], len(self.transfer.buffer)))
+        evaluate(self, *rest)
+
+    monkeypatch.setattr(Deployment, "evaluate", watched)
+    given = [f"checkpoint={pretrained}", "gap=pendulum_torque", "method.updates=0"]
+    assert here("deploy", *given, f"run_dir={tmp_path / 'one'}", "rollouts=1").returncode == 0
+    assert here("deploy", *given, f"run_dir={tmp_path / 'none'}", "rollouts=0").returncode == 0
+    assert [s[:2] for s in seen] == [(True, 0), (True, 1), (False, 0)] and seen[0][2] == 0
+    curves = [json.loads((tmp_path / name / "summary.json").read_text())["return_curve"] for name in ("one", "none")]
+    assert curves[0]["0"] == curves[1]["0"]
 
 
 def test_a_warm_up_is_measured_by_the_model_that_drove_it(pretrained, tmp_path):

@@ -121,6 +121,7 @@ def test_a_process_collects_what_this_one_would(at_random):
     for other in found[1:]:
         assert (found[0].steps == other.steps).all() and other.unstable == 0 and other.shapes == order.shapes
         torch.testing.assert_close(found[0].places, other.places, rtol=0, atol=0, equal_nan=True)
+    assert all(min(other.seconds["physics"], other.seconds["act"]) > 0 for other in found)
     assert found[0].steps.shape == (3, build.make_env(cfg, 1).task.episode_steps)
 
 

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import csv
 import os
+import shutil
 import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
+from contextlib import ExitStack
+from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 
 import psutil
@@ -75,21 +79,52 @@ def test_a_killed_worker_costs_its_share_and_nothing_else(agent, cluster, expect
     assert victim.pid not in {p.pid for p in workers_of(psutil.Process())}
 
 
-def test_an_address_that_nobody_answers_is_one_line_soon(agent) -> None:
-    with socket.socket() as taken:  # bound, not listening
+def pretrain(*words: str, **more: str) -> subprocess.CompletedProcess[str]:
+    line = [sys.executable, "-m", "mpc_sgft.pretrain", "--quiet", "task=pendulum", "+experiment=debug", *words]
+    return subprocess.run(line, stderr=subprocess.PIPE, text=True, env=os.environ | more, timeout=120, check=False)
+
+
+@pytest.mark.parametrize("kind", ["closed", "full", "silent", "web", "somewhere"])
+def test_an_address_without_a_cluster_is_one_line_soon(kind: str, tmp_path: Path) -> None:
+    """Nobody listens, nobody accepts, nobody speaks, or somebody speaks something else."""
+    says = {"closed": "nobody answers", "web": "something answers that is no Ray cluster", "somewhere": "host:port"}
+    with socket.socket() as taken, ExitStack() as others:
         taken.bind(("127.0.0.1", 0))
+        if kind in ("full", "silent"):
+            taken.listen(0)
+        for _ in range(3 if kind == "full" else 0):  # nobody accepts, and there is no more room to wait
+            other = others.enter_context(socket.socket())
+            other.setblocking(False)
+            other.connect_ex(taken.getsockname())
+        port = taken.getsockname()[1]
+        if kind == "web":
+            server = others.enter_context(HTTPServer(("127.0.0.1", 0), BaseHTTPRequestHandler))
+            threading.Thread(target=server.serve_forever, daemon=True).start()
+            others.callback(server.shutdown)
+            port = server.server_address[1]
+        address = "somewhere" if kind == "somewhere" else f"127.0.0.1:{port}"
         began = time.monotonic()
-        with pytest.raises(UserError, match=r"collector.address=127.0.0.1:\d+: nobody answers") as found:
-            Ray(CFG, agent.model.sizes, workers=1, address=f"127.0.0.1:{taken.getsockname()[1]}")
-    assert time.monotonic() - began < 15 and "\n" not in str(found.value)
+        done = pretrain("collector=ray", f"collector.address={address}", f"run_dir={tmp_path / 'r'}")
+    assert done.returncode == 2 and done.stderr.count("\n") == 1, done.stderr
+    assert f"collector.address={address}: {says.get(kind, 'no answer within 4 s')}" in done.stderr, done.stderr
+    assert time.monotonic() - began < 15 and not (tmp_path / "r").exists()
 
 
-def test_what_answers_and_is_no_cluster_is_one_line(agent, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ray_collector, "JOINED", 4.0)
-    with socket.create_server(("127.0.0.1", 0)) as silent:  # accepts, and says nothing
-        with pytest.raises(UserError, match="something answers, but no Ray cluster .* within 4 s") as found:
-            Ray(CFG, agent.model.sizes, workers=1, address=f"127.0.0.1:{silent.getsockname()[1]}")
-    assert "\n" not in str(found.value)
+@pytest.mark.slow
+def test_a_cluster_that_lets_nobody_in_is_one_line(tmp_path: Path) -> None:
+    token = {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": "0" * 32}
+    line = [sys.executable, "-c", HEAD]
+    with subprocess.Popen(
+        line, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=os.environ | token
+    ) as head:
+        assert head.stdin and head.stdout
+        try:
+            words = f"collector.address={head.stdout.readline().strip()}", f"run_dir={tmp_path / 'r'}"
+            done = pretrain("collector=ray", *words, **token | {"RAY_AUTH_TOKEN": "1" * 32})
+        finally:
+            head.stdin.close()
+    assert done.returncode == 2 and done.stderr.count("\n") == 1, done.stderr
+    assert "Ray could not join that cluster" in done.stderr and "asks for a token" in done.stderr
 
 
 def test_a_cluster_that_is_there_is_joined_and_left_as_it_was(tmp_path: Path) -> None:
@@ -149,16 +184,38 @@ def _without_seconds(path: Path) -> list[dict[str, str]]:
         return [{name: text for name, text in row.items() if name != "seconds"} for row in csv.DictReader(file)]
 
 
-def test_what_is_no_address_is_refused(agent) -> None:
-    with pytest.raises(UserError, match="collector.address=somewhere: host:port"):
-        Ray(CFG, agent.model.sizes, workers=1, address="somewhere")
-
-
 def test_a_worker_of_another_version_is_named(cluster, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ray_collector, "versions", lambda: {"mpc_sgft": "9.9"})
     monkeypatch.setattr(cluster, "close", lambda: None)  # the other tests go on with it
     with pytest.raises(UserError, match="the worker on .* has .*'mpc_sgft': '0.* this process .*9.9"):
         cluster._check_versions()
+
+
+def test_another_state_of_our_own_code_is_another_version(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert ray_collector.versions() == ray_collector.versions()
+    for package in ray_collector.OURS:
+        shutil.copytree(
+            ray_collector.ROOT / package, tmp_path / package, ignore=shutil.ignore_patterns("*.safetensors")
+        )
+    before = ray_collector.versions()
+    monkeypatch.setattr(ray_collector, "ROOT", tmp_path)
+    assert ray_collector.versions() == before
+    (tmp_path / "envs" / "task.py").write_text("# changed\n")
+    assert ray_collector.versions() != before
+
+
+def test_a_worker_that_cannot_start_is_one_line(cluster, monkeypatch: pytest.MonkeyPatch) -> None:
+    import ray
+
+    class Broken:
+        def versions(self) -> None:
+            raise ImportError("no module of that name")
+
+    monkeypatch.setattr(cluster, "close", lambda: None)
+    monkeypatch.setattr(cluster, "_workers", [ray.remote(num_cpus=0)(Broken).remote()])
+    with pytest.raises(UserError, match="a worker cannot start: .*no module of that name. Is mpc_sgft") as found:
+        cluster._check_versions()
+    assert "\n" not in str(found.value)
 
 
 def test_ctrl_c_leaves_no_process_behind(tmp_path: Path) -> None:
