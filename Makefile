@@ -57,11 +57,15 @@ demo: setup ## Deploy the shipped checkpoint into a hidden gap, in simulation (m
 	@$(BIN)/python -m mpc_sgft.deploy --backend sim +experiment=demo
 
 # What the tests need beside setup, where it can be had here; what cannot is left out and named at the end of the run.
-test-setup: setup system client
+test-setup: setup system client launcher
 
 client: setup
 	@[ "$$(uname -s)" != Linux ] || $(MAKE) --no-print-directory robot \
 	  || echo "the robot's client could not be installed: its tests are left out, its types unknown"
+
+launcher: setup
+	@$(BIN)/python -c 'import hydra_plugins.hydra_ray_launcher' 2> /dev/null \
+	  || $(BIN)/python -m pip install -q --no-deps hydra-ray-launcher==1.2.2
 
 test: test-setup ## Set up what the tests need, and run the fast ones.
 	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n $(WORKERS) -m "not slow" $(TESTS)

@@ -19,6 +19,7 @@ NEEDS = {  # what a test may need, and what brings it
     "the robot's client": "make robot",
     "the camera's packages": "make system setup",
     "wandb": "make setup",
+    "Ray's launcher": "make launcher",
     "Ray": "make setup",
     "MuJoCo Warp": "make setup",
     "submitit": "make setup",

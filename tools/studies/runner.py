@@ -43,7 +43,7 @@ def finished(
     Raises:
         RunFailed: If the command does, if the folder is of a run with other overrides, or its summary cannot be read.
     """
-    asked_before(folder, [command, *(word for word in overrides if not word.startswith("hydra."))])
+    asked_before(folder, [command, *(word for word in overrides if not word.lstrip("+").startswith("hydra."))])
     summary = folder / "summary.json"
     if not summary.exists():
         words = [f"run_dir={folder}", "quiet=true", *overrides, *first]

@@ -45,6 +45,15 @@ def test_a_launcher_starts_a_run_elsewhere(tmp_path):
         finished("evaluate", tmp_path / "begun", words, launcher)
 
 
+def test_runs_are_jobs_on_a_ray_cluster(tmp_path):
+    pytest.importorskip("hydra_plugins.hydra_ray_launcher", reason="needs Ray's launcher")
+    few = "+hydra.launcher.ray.init.num_cpus=1"
+    found = finished("evaluate", tmp_path / "run", ["task=pendulum", "policy=scripted", "episodes=2", few], "ray")
+    assert found["episodes"] == 2 and (tmp_path / "run.asked").read_text().count("hydra") == 0
+    with pytest.raises(RunFailed, match="No checkpoint at /nowhere"):
+        finished("evaluate", tmp_path / "bad", ["checkpoint=/nowhere/at/all", "episodes=2", few], "ray")
+
+
 def test_a_failure_is_told_and_the_others_go_on(tmp_path, capsys):
     def work(name):
         if name == "bad":
