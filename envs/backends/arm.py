@@ -90,10 +90,10 @@ class Arm:
         mode = self.franky.RealtimeConfig.Enforce if self.realtime == "enforce" else self.franky.RealtimeConfig.Ignore
         found = within(self.timeout, lambda: self.franky.Robot(self.ip, realtime_config=mode), "robot", self.ip)
         self._call(lambda: found.set_collision_behavior(*self.thresholds))
-        mass, centre = self.load
-        if mass:
-            inertia = (mass * 0.05**2 * np.eye(3)).ravel().tolist()
-            self._call(lambda: found.set_load(mass, [float(x) for x in centre], inertia))
+        mass = self.load[0]  # none is told, too: the robot keeps what the last client said
+        centre = [float(x) for x in self.load[1]] if mass else [0.0, 0.0, 0.0]
+        inertia = (mass * 0.05**2 * np.eye(3)).ravel().tolist()
+        self._call(lambda: found.set_load(mass, centre, inertia))
         self.robot = found  # only now: whoever tries again must set them again
 
     def read(self) -> ArmState:

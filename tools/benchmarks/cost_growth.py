@@ -119,7 +119,7 @@ def disk() -> list[dict[str, object]]:
 
 def thousand() -> list[dict[str, object]]:
     """Bytes of a run of 1000 rollouts."""
-    found = sizes(1000, "planner.num_candidates=64", "planner.iterations=2")
+    found = sizes(1000, "planner.num_candidates=64", "planner.num_elites=8", "planner.iterations=2")
     return [_row("disk", name, "1000 rollouts", size / 1e6, "MB") for name, size in found.items()]
 
 

@@ -132,6 +132,18 @@ def test_a_connection_that_did_not_finish_counts_for_nothing(
     assert len(calls) == 2 and arm.robot is None
 
 
+def test_no_load_takes_back_the_load_of_before(stand_in: StandIn, robot_config: dict) -> None:
+    """The robot keeps what the last client told it."""
+    told = []
+    for mass in (0.3, 0.0):
+        arm = Arm(stand_in.ip, **{**robot_config["arm"], "timeout": 30, "load_mass": mass})
+        arm.connect()
+        time.sleep(0.3)  # the first states may be older
+        told.append(arm.robot.state.m_load)
+        arm.close()
+    assert told == pytest.approx([0.3, 0.0])
+
+
 @pytest.mark.parametrize("patience", [None, -1.0, float("inf")])
 def test_patience_is_a_number_of_seconds(patience: float | None) -> None:
     with pytest.raises(ValueError, match="patience=.*a number of seconds, 0 or more"):
