@@ -77,7 +77,8 @@ def test_a_resumed_run_changes_what_is_given_as_another_setting_too(loops: Path)
 @pytest.mark.parametrize(
     "change",
     ["task=pendulum", "seed=1", "gap.effects.payload.mass=1", "run_dir=other", "model.mlp_dim=16", "method.lr=1e-5"]
-    + ["method.residual=true", "method.command_band=false", "method.suspicion_margin=0"],
+    + ["method.residual=true", "method.command_band=false", "method.suspicion_margin=0"]
+    + ["method.slice_len=8", "method.gate_excess=0"],
 )
 def test_resume_refuses_to_become_another_run(change: str, loops: Path, capsys) -> None:
     assert cli.run(probe("folder"), ["run_dir=first"]) == 0

@@ -38,7 +38,6 @@ from hydra.utils import instantiate
 from envs.task import AbstractTask
 from mpc_sgft.command.errors import UserError, disk_error, from_config
 from mpc_sgft.diagnose.deployments.recordings import joint_columns, run_config
-from mpc_sgft.diagnose.simulation.plant import SCALAR
 from mpc_sgft.storage.episode_file import Episode, read_episode
 
 WRITER = Path(__file__).with_name("write_lerobot.py")
@@ -146,7 +145,8 @@ def features(episode: Episode, task: AbstractTask, *, only_complete: bool) -> tu
 def names(task: AbstractTask, metadata: dict[str, Any]) -> dict[str, list[str]]:
     """Feature -> a name for each entry."""
     model = task.spec().compile()
-    joints = [model.joint(i).name for i in range(model.njnt) if int(model.jnt_type[i]) in SCALAR]
+    at = {int(model.jnt_qposadr[i]): model.joint(i).name for i in range(model.njnt)}
+    joints = [at[i] for i in joint_columns(task, "qpos")]
     actions = [f"action_{i}" for i in range(task.action_dim)]
     single = ("next.reward", "next.success", "next.done", "next.invalid", "aborted")
     return {

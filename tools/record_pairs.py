@@ -4,6 +4,7 @@ import json
 import time
 from dataclasses import asdict
 from importlib import import_module
+from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -51,7 +52,9 @@ def record(robot_ip: str, serial: str, folder: Path, recording: Path | None = No
             if np.abs(state.dq).max() > AT_REST:
                 print("the robot moves; wait until it rests")
                 continue
-            name = f"{len(pairs):02d}.png"
+            name = next(
+                n for n in map("{:02d}.png".format, count()) if not (folder / n).exists()
+            )  # pairs may be left out
             _save(folder / name, _fresh(camera))
             pairs.append({"base_T_hand": np.asarray(state.O_T_EE.matrix).tolist(), "image": name})
             whole = {"serial": camera.serial, "intrinsics": asdict(camera.intrinsics), "pairs": pairs}

@@ -10,7 +10,7 @@ from envs.effects.base import Effect, pick
 
 @dataclass(frozen=True)
 class ActuatorDelay(Effect):
-    """Delay every actuator's signal; MuJoCo's own actuator history carries it (`actuator_delay`)."""
+    """Delay every actuator's signal, beyond its own; MuJoCo's own actuator history carries it (`actuator_delay`)."""
 
     delay: float = 0.0
     at: tuple[str, ...] = ()  # actuators; all if empty
@@ -20,9 +20,9 @@ class ActuatorDelay(Effect):
 
     def edit_spec(self, spec: mujoco.MjSpec) -> None:
         for actuator in pick(spec.actuators, self.at, "actuator"):
-            actuator.delay = self.delay
+            actuator.delay += self.delay
             # MuJoCo silently clips a delay that its buffer cannot hold
-            actuator.nsample = max(actuator.nsample, int(self.delay / spec.option.timestep) + 2)
+            actuator.nsample = max(actuator.nsample, int(actuator.delay / spec.option.timestep) + 2)
 
 
 EFFECT = ActuatorDelay

@@ -33,7 +33,9 @@ class ContactSoftness(Effect):
             if first > 0:
                 geom.solref[0] = first + self.time_constant
             else:  # (-stiffness, -damping): the same damping ratio at a longer time constant
-                own = 2 / (geom.solimp[1] * -second)
+                if not second:
+                    raise ValueError(f"contact_softness: the contacts of geom {geom.name!r} have no damping (solref)")
+                own = 2 / -second
                 scale = own / (own + self.time_constant)
                 geom.solref = np.array([first * scale**2, second * scale])
         if self.at:

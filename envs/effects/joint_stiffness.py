@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 
 from envs.effects.base import SPRING, Effect
-from envs.effects.passive import scalar_joints, unused_name
+from envs.effects.passive import plain, scalar_joints, unused_name
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class JointStiffness(Effect):
                 joint.stiffness[0] = self.stiffness
                 joint.springref = np.rad2deg(self.rest) if in_degrees else self.rest
             else:
-                tendon = spec.add_tendon(name=unused_name(spec.tendons, f"{SPRING}{joint.name}"))
+                tendon = plain(spec.add_tendon(name=unused_name(spec.tendons, f"{SPRING}{joint.name}")), "tendon")
                 tendon.wrap_joint(joint.name, 1.0)
                 tendon.stiffness[0], tendon.springlength = self.stiffness, [self.rest, self.rest]
 

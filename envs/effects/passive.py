@@ -5,6 +5,8 @@ With an affine bias its force is min(max(constant + slope * speed, low), high); 
 that is piecewise linear in the speed. MuJoCo's implicit integrators know the slope, and plain MJCF keeps all of it.
 """
 
+from typing import Any
+
 import mujoco
 import numpy as np
 
@@ -12,6 +14,22 @@ from envs.effects.base import pick
 
 NO_LIMIT = 1e10  # [N or N m] MJCF knows no infinity
 SCALAR = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+OF_A_SCENE = {
+    "classname",
+    "compiler",
+    "default",
+    "frame",
+    "id",
+    "info",
+    "name",
+    "parent",
+    "path",
+    "plugin",
+    "signature",
+    "userdata",
+}
+
+EMPTY = mujoco.MjSpec()  # kept, because its defaults go with it
 
 
 def scalar_joints(spec: mujoco.MjSpec, at: tuple[str, ...]) -> list[mujoco.MjsJoint]:
@@ -36,6 +54,62 @@ def unused_name(elements: list, name: str) -> str:
     return next(n for n in (name, *(f"{name}_{i}" for i in range(2, len(taken) + 3))) if n not in taken)
 
 
+def plain(element: Any, kind: str) -> Any:
+    """An element that an effect has just added, as if its scene had no `<default>`, which is meant for others.
+
+    Args:
+        element: Of a scene; changed, and returned.
+        kind: "joint", "actuator" or "tendon".
+    """
+    without = getattr(EMPTY.default, kind)
+    for field in dir(without):
+        if not field.startswith("_") and field not in OF_A_SCENE and not callable(getattr(without, field)):
+            setattr(element, field, getattr(without, field))
+    return element
+
+
+def drives_of(spec: mujoco.MjSpec, joint: str) -> list[Any]:
+    """The actuators with an input that turn a joint."""
+    kinds, without = (
+        (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT),
+        int(mujoco.mjtCtrlInput.mjINPUT_NONE),
+    )
+    return [a for a in spec.actuators if joint and a.target == joint and a.trntype in kinds and a.ctrlspec != without]
+
+
+def limit_drives(spec: mujoco.MjSpec, joint: mujoco.MjsJoint, effect: str) -> None:
+    """Let a joint's own limit of what actuators give it (`actuatorfrcrange`) be that of its drive, not of friction.
+
+    Args:
+        spec: The scene.
+        joint: Of the scene.
+        effect: Who asks, for the message.
+
+    Raises:
+        ValueError: If several drives share the limit.
+    """
+    low, high = joint.actfrcrange
+    if not _limited(joint.actfrclimited, joint.actfrcrange, spec):
+        return
+    drives = drives_of(spec, joint.name)
+    if len(drives) > 1:
+        raise ValueError(
+            f"{effect}: the drives {', '.join(a.name for a in drives)} share the limit of {joint.name!r} "
+            "(actuatorfrcrange), which would hold for friction, too. Give each a forcerange instead"
+        )
+    for drive in drives:
+        ends = sorted((low / drive.gear[0], high / drive.gear[0]))
+        if _limited(drive.forcelimited, drive.forcerange, spec):
+            ends = [max(ends[0], drive.forcerange[0]), min(ends[1], drive.forcerange[1])]
+        drive.forcelimited, drive.forcerange = 1, ends
+    joint.actfrclimited, joint.actfrcrange = int(mujoco.mjtLimited.mjLIMITED_FALSE), [0.0, 0.0]
+
+
+def _limited(flag: int, ends: Any, spec: mujoco.MjSpec) -> bool:
+    auto = flag == int(mujoco.mjtLimited.mjLIMITED_AUTO) and spec.compiler.autolimits and ends[0] < ends[1]
+    return bool(auto or flag == int(mujoco.mjtLimited.mjLIMITED_TRUE))
+
+
 def add_force(
     spec: mujoco.MjSpec,
     name: str,
@@ -57,7 +131,10 @@ def add_force(
         limits: (low, high); None for no limits.
     """
     kind = mujoco.mjtTrn.mjTRN_JOINT if at_joint else mujoco.mjtTrn.mjTRN_SITE
-    actuator = spec.add_actuator(name=unused_name(spec.actuators, name), target=target, trntype=kind)
+    if at_joint:
+        limit_drives(spec, spec.joint(target), name.partition("/")[0])
+    actuator = plain(spec.add_actuator(name=unused_name(spec.actuators, name)), "actuator")
+    actuator.target, actuator.trntype = target, kind
     actuator.gaintype, actuator.biastype = mujoco.mjtGain.mjGAIN_DCMOTOR, mujoco.mjtBias.mjBIAS_AFFINE
     actuator.dyntype, actuator.actearly = mujoco.mjtDyn.mjDYN_DCMOTOR, 1
     actuator.ctrlspec = int(mujoco.mjtCtrlInput.mjINPUT_NONE)

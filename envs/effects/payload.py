@@ -8,6 +8,8 @@ import mujoco
 from envs.effects.base import Effect, pick
 from envs.effects.passive import unused_name
 
+RADIUS = 0.01  # [m]
+
 
 @dataclass(frozen=True)
 class Payload(Effect):
@@ -28,10 +30,13 @@ class Payload(Effect):
                     "that a load would do nothing"
                 )
             load = body.add_body(name=unused_name(spec.bodies, f"payload_{body.name}"), pos=list(self.position))
+            load.mass, load.inertia, load.ipos = self.mass, [0.4 * self.mass * RADIUS**2] * 3, [0.0, 0.0, 0.0]
+            load.explicitinertial = True  # whatever the scene's compiler infers from geoms
             load.add_geom(
                 type=mujoco.mjtGeom.mjGEOM_SPHERE,
-                size=[0.01, 0, 0],
+                size=[RADIUS, 0, 0],
                 mass=self.mass,
+                group=spec.compiler.inertiagrouprange[0],
                 contype=0,
                 conaffinity=0,
                 rgba=[0, 0, 0, 0],

@@ -4,13 +4,13 @@ A tendon, joint - rotor, holds the two together. Within the play of a gear it do
 an elastic drive, pulls like a spring.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
 
 from envs.effects.base import ROTOR, Array
-from envs.effects.passive import effective_inertia, scalar_joints
+from envs.effects.passive import drives_of, effective_inertia, plain, scalar_joints
 
 FASTEST = 1.0  # oscillation of rotor and joint against each other, in radians a physics step
 MOST_DAMPED = 0.25  # share of their speed against each other that a step may take
@@ -18,6 +18,7 @@ ROTOR_SHARE = 0.05  # of the joint's inertia, where the model has no armature
 IMPLICIT = (int(mujoco.mjtIntegrator.mjINT_IMPLICIT), int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST))
 SOON = 1e-4  # [s] to differentiate forces along the motion
 CENTRE_MASS = 1e-9  # [kg] MuJoCo wants a mass; the rotor's inertia is its joint's armature
+CENTRE_INERTIA = 1e-14  # [kg m^2] with the mass the size of 8 mm, so that a fluid has nothing to hold
 
 
 class Coupling(NamedTuple):
@@ -85,7 +86,7 @@ def driven_joints(spec: mujoco.MjSpec, at: tuple[str, ...], effect: str) -> list
         ValueError: For a joint in `at` that is not there or that nothing drives.
     """
     joints = scalar_joints(spec, at)
-    driven = [j for j in joints if _drives_of(spec, j.name) or _tendon_of(spec, j.name)]
+    driven = [j for j in joints if drives_of(spec, j.name) or _tendon_of(spec, j.name)]
     idle = [j.name for j in joints if at and j not in driven]
     if idle:
         raise ValueError(f"{effect}: no actuator drives the joint {idle[0]!r}, so nothing lies between the two")
@@ -125,18 +126,17 @@ def _tendon_of(spec: mujoco.MjSpec, joint: str) -> mujoco.MjsTendon | None:
     return next((tendon for tendon in spec.tendons if tendon.name == ROTOR + joint), None)
 
 
-def _drives_of(spec: mujoco.MjSpec, joint: str) -> list[Any]:
-    return [a for a in spec.actuators if _drives(a, joint)]
-
-
 def _add_rotor(spec: mujoco.MjSpec, joint: mujoco.MjsJoint, inertia: float) -> mujoco.MjsTendon:
-    drives, address = _drives_of(spec, joint.name), int(spec.copy().compile().joint(joint.name).qposadr[0])
+    drives, address = drives_of(spec, joint.name), int(spec.copy().compile().joint(joint.name).qposadr[0])
     joint.armature -= inertia  # rotor and joint together weigh what they did
-    body = spec.worldbody.add_body(name=ROTOR + joint.name, mass=CENTRE_MASS, inertia=[CENTRE_MASS] * 3)
+    body = spec.worldbody.add_body(name=ROTOR + joint.name, mass=CENTRE_MASS, inertia=[CENTRE_INERTIA] * 3)
     body.ipos, body.explicitinertial = np.zeros(3), True
-    rotor = body.add_joint(name=ROTOR + joint.name, type=joint.type, axis=[0, 0, 1], armature=inertia)
+    rotor = plain(body.add_joint(name=ROTOR + joint.name), "joint")
+    rotor.type, rotor.axis, rotor.armature = joint.type, [0, 0, 1], inertia
     rotor.range, rotor.limited = joint.range, int(mujoco.mjtLimited.mjLIMITED_FALSE)
-    tendon = spec.add_tendon(name=ROTOR + joint.name)
+    rotor.actfrclimited, rotor.actfrcrange = joint.actfrclimited, joint.actfrcrange  # what limits drives goes with them
+    joint.actfrclimited, joint.actfrcrange = int(mujoco.mjtLimited.mjLIMITED_FALSE), [0.0, 0.0]
+    tendon = plain(spec.add_tendon(name=ROTOR + joint.name), "tendon")
     tendon.wrap_joint(joint.name, 1.0)
     tendon.wrap_joint(rotor.name, -1.0)
     for actuator in drives:
@@ -147,12 +147,6 @@ def _add_rotor(spec: mujoco.MjSpec, joint: mujoco.MjsJoint, inertia: float) -> m
         if len(key.qvel):
             key.qvel = [*key.qvel, 0.0]
     return tendon
-
-
-def _drives(actuator: Any, joint: str) -> bool:
-    kinds = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
-    has_input = actuator.ctrlspec != int(mujoco.mjtCtrlInput.mjINPUT_NONE)
-    return bool(joint) and actuator.target == joint and actuator.trntype in kinds and has_input
 
 
 def place_rotors(

@@ -7,7 +7,15 @@ import mujoco
 import numpy as np
 
 from envs.effects.base import Array, Effect
-from envs.effects.passive import add_force, effective_inertia, scalar_joints, stiff_dry_friction, unused_name
+from envs.effects.passive import (
+    add_force,
+    effective_inertia,
+    limit_drives,
+    plain,
+    scalar_joints,
+    stiff_dry_friction,
+    unused_name,
+)
 
 # exp(-x^2) by straight lines, least squares over knots and heights: at most 0.028 off
 KNOTS = np.array([0.274, 1.257, 1.95])
@@ -89,7 +97,9 @@ class StribeckFriction(Effect):
             return
         stiffness = min(level / self.deflection, inertia * (RESOLVED / spec.option.timestep) ** 2)
         name = unused_name(spec.actuators, BRISTLE + joint)
-        force = spec.add_actuator(name=name, target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+        limit_drives(spec, spec.joint(joint), "stribeck_friction")
+        force = plain(spec.add_actuator(name=name), "actuator")
+        force.target, force.trntype = joint, mujoco.mjtTrn.mjTRN_JOINT
         slides = [max(x, FLAT * level) for x in (self.coulomb, self.static)]
         force.set_to_dcmotor(
             motorconst=[0.0, 0.0],

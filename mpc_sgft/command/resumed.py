@@ -17,7 +17,7 @@ from mpc_sgft.command.errors import UserError
 STORED = ("model.", "train.replay.", "train.agent.entropy_coef")  # what a checkpoint holds: sizes, what has trained
 TRAINED = {  # which parts of a model train, and on what
     "method.residual", "method.command_map", "method.command_band", "method.observation_map", "method.suspicion_margin",
-    "method.encoder", "method.reward", "method.simulated_episodes",
+    "method.encoder", "method.reward", "method.simulated_episodes", "method.slice_len", "method.gate_excess",
 }  # fmt: skip
 OPTIMISED = {"lr", "policy_lr", "command_lr", "observation_lr", "encoder_lr_share", "entropy_lr"}  # its optimisers hold
 

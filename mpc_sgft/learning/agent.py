@@ -119,7 +119,7 @@ class Agent:
                 in the next update that is read.
 
         Raises:
-            FloatingPointError: If an entry of the batch or a loss is not finite; this update has changed no parameter.
+            FloatingPointError: If an entry of the batch or a loss is not finite; that loss has changed no parameter.
         """
         data, policy_too = arranged(batch, self.device), self.updates % self.policy_delay == 0
         if read or self._graphs is None or not self.pretraining:

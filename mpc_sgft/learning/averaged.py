@@ -33,7 +33,7 @@ class AveragedWeights:
         self.begun = True
 
     def state_dict(self) -> dict[str, Any]:
-        return {"model": self.model.state_dict(), "begun": self.begun}
+        return {"model": {k: x.clone() for k, x in self.model.state_dict().items()}, "begun": self.begun}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         self.model.load_state_dict(state["model"])

@@ -101,6 +101,18 @@ def check_simulated(episodes: int, least: int) -> None:
         raise ValueError(f"simulated_episodes={episodes} must be {least} or more.")
 
 
+def check_acting(gate_margin: float, gate_memory: int, average_decay: float, policy_share: float) -> None:
+    """Raise ValueError for numbers by which nothing, or nothing that was learned, would act."""
+    if gate_margin <= 0:
+        raise ValueError(f"gate_margin={gate_margin} must be more than 0.")
+    if gate_memory < 1:
+        raise ValueError(f"gate_memory={gate_memory} must be 1 rollout or more.")
+    if not 0 <= average_decay < 1:
+        raise ValueError(f"average_decay={average_decay} must lie in [0, 1).")
+    if not 0 <= policy_share <= 1:
+        raise ValueError(f"policy_share={policy_share} must lie in [0, 1].")
+
+
 def check_win_stay(win_stay: int) -> None:
     """Raise ValueError if the rollouts of a streak are no number of them."""
     if not isinstance(win_stay, int) or win_stay < 0:

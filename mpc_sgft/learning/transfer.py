@@ -246,7 +246,7 @@ class Transfer:
             "buffer": self.buffer.state_dict(),
             "simulated": None if self.simulated is None else self.simulated.state_dict(),
             "averaged": self.averaged.state_dict(),
-            "acting": self.acting.state_dict(),
+            "acting": {k: x.clone() for k, x in self.acting.state_dict().items()},
             "starts": [x.clone() for x in self.starts],
             "verdicts": [v.state() for v in self.verdicts],
             "simulated_error": self.simulated_error,

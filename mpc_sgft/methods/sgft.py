@@ -11,7 +11,7 @@ from torch import Tensor
 from mpc_sgft.learning.agent import Agent, floats
 from mpc_sgft.learning.dynamics import Dynamics
 from mpc_sgft.learning.fit import Maps, Penalty, Suspicion, fit_dynamics
-from mpc_sgft.learning.method import AbstractMethod, Gate, check_objective, check_win_stay
+from mpc_sgft.learning.method import AbstractMethod, Gate, check_acting, check_objective, check_win_stay
 from mpc_sgft.learning.observation_map import ObservationMap, Sensed
 from mpc_sgft.learning.slices import to_slices
 from mpc_sgft.learning.world_model import WorldModel
@@ -98,6 +98,7 @@ class SGFT(AbstractMethod):
     ):
         check_objective(horizon, rho)
         check_win_stay(win_stay)
+        check_acting(gate_margin, gate_memory, average_decay, policy_share)
         if gate_excess < 0:
             raise ValueError(f"gate_excess={gate_excess} must be 0 or more.")
         if not 0 <= suspicion_margin < 1:

@@ -4,7 +4,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from mpc_sgft.learning.agent import Agent
-from mpc_sgft.learning.method import AbstractMethod, Gate, check_win_stay
+from mpc_sgft.learning.method import AbstractMethod, Gate, check_acting, check_win_stay
 from mpc_sgft.learning.observation_map import Sensed
 from mpc_sgft.learning.optimizers import PRETRAINED
 from mpc_sgft.learning.world_model import TERMINALS
@@ -47,6 +47,7 @@ class TDMPC2(AbstractMethod):
         win_stay: int = 0,  # runs of before have none
     ):
         check_win_stay(win_stay)
+        check_acting(gate_margin, gate_memory, average_decay, policy_share)
         if terminal not in TERMINALS:
             raise ValueError(f"terminal={terminal!r}. Available: {', '.join(TERMINALS)}.")
         self.terminal = terminal

@@ -123,6 +123,11 @@ class Deployment:
         self.state["spent"] = self.watch.spent
         if cfg.resume is not None:
             self._resume()
+            if agent.frozen_hash() != self.frozen:
+                raise UserError(
+                    f"cannot resume {cfg.resume}: its checkpoint ({cfg.checkpoint or 'the shipped one'}) is not the "
+                    "one that the run began with. Put that one back, or start a run."
+                )
             self.watch.spent = self.state["spent"]
         self.logger = self.make_logger(self.state["rollouts"] if cfg.resume is not None else None)
         self.metrics: dict[str, float] = {}  # of the last rollout

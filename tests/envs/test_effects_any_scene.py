@@ -36,8 +36,16 @@ PLANTS = {
       </worldbody><actuator><general name="push" joint="cart" gainprm="8"/></actuator></mujoco>""".replace(
         '<joint type="slide"', '<joint name="cart" type="slide"'
     ),
+    "with defaults": f"""{HEAD}<default>
+        <joint damping="1" frictionloss="0.2" armature="0.02" stiffness="0.5"/><motor gear="4"/>
+        <tendon stiffness="5" damping="1" frictionloss="0.5"/>
+      </default><worldbody><body><joint name="hinge" axis="0 1 0"/>{LINK}</body></worldbody>
+      <actuator><motor name="m" joint="hinge"/></actuator></mujoco>""",
     "arm and puck": None,
 }
+WRITTEN_OUT = f"""{HEAD}<worldbody><body>
+        <joint name="hinge" axis="0 1 0" damping="1" frictionloss="0.2" armature="0.02" stiffness="0.5"/>{LINK}
+      </body></worldbody><actuator><motor name="m" joint="hinge" gear="4"/></actuator></mujoco>"""
 NO_ZERO = {"actuator_delay", "actuator_lag", "contact_friction", "payload"}  # add a state or a body, or set a value
 SIZES = {  # clearly different from nothing, for any of the plants
     "actuator_delay": {"delay": 0.02},
@@ -131,6 +139,108 @@ def test_an_effect_fits_the_scene_and_its_mjcf(make_task, plant, name) -> None:
         assert np.abs(moved - plain).max() > 1e-6
     reloaded = mujoco.MjModel.from_xml_string(edited.to_xml())
     np.testing.assert_allclose(_move(reloaded, nominal), moved, atol=1e-6)
+
+
+NATIVE_SIZES = [(name, SIZES[name]) for name in sorted(set(NATIVE) & set(SIZES))]
+NATIVE_SIZES += [("stribeck_friction", SIZES["stribeck_friction"] | {"deflection": 0.001})]
+
+
+@pytest.mark.parametrize(("name", "size"), NATIVE_SIZES)
+def test_what_an_effect_adds_takes_nothing_of_the_scene_s_defaults(make_task, name, size) -> None:
+    moved = []
+    for spec in (_scene("with defaults", make_task), mujoco.MjSpec.from_string(WRITTEN_OUT)):
+        nominal = spec.copy().compile()
+        moved.append(_move(_edited(spec, name, size | _at(spec, name)).compile(), nominal))
+    assert np.array_equal(*moved)
+
+
+@pytest.mark.parametrize(("name", "size"), NATIVE_SIZES)
+def test_a_joint_s_limit_of_its_drive_is_no_limit_of_what_else_acts_there(name, size) -> None:
+    """`actuatorfrcrange`, which URDFs give joints, as much as a range of the drive."""
+    drive, joint = '<motor name="m" joint="hinge" gear="-2"{}/>', '<joint name="hinge" axis="0 1 0"{}/>'
+    scene = f"{HEAD}<worldbody><body>{joint}{LINK}</body></worldbody><actuator>{drive}</actuator></mujoco>"
+    moved = []
+    for limit, reach in ((' actuatorfrcrange="-0.3 0.2"', ""), ("", ' forcerange="-0.1 0.15"')):
+        spec = mujoco.MjSpec.from_string(scene.format(limit, reach))
+        nominal = spec.copy().compile()
+        moved.append(_move(_edited(spec, name, size | _at(spec, name)).compile(), nominal))
+    np.testing.assert_allclose(*moved, atol=1e-9)
+
+
+def test_drives_that_share_a_limit_are_told_to_have_their_own() -> None:
+    drives = '<actuator><motor name="a" joint="hinge"/><motor name="b" joint="hinge"/></actuator></mujoco>'
+    joint = '<joint name="hinge" axis="0 1 0" actuatorfrcrange="-1 1"/>'
+    spec = mujoco.MjSpec.from_string(f"{HEAD}<worldbody><body>{joint}{LINK}</body></worldbody>{drives}")
+    with pytest.raises(ValueError, match="asymmetric_friction: the drives a, b share the limit of 'hinge'"):
+        _edited(spec, "asymmetric_friction", {"forward": 1.0})
+
+
+def test_a_rotor_does_not_swim() -> None:
+    scene = f"""{HEAD.replace("timestep", 'density="1000" viscosity="0.001" timestep')}<worldbody><body>
+        <joint name="hinge" axis="0 0 1"/>{LINK}</body></worldbody>
+      <actuator><motor name="m" joint="hinge"/></actuator></mujoco>"""
+    speeds = []
+    for name, size in (("flexible_joint", {}), ("flexible_joint", {"compliance": 1e-4}), ("backlash", {"gap": 1e-4})):
+        model = _edited(mujoco.MjSpec.from_string(scene), name, size).compile()
+        data = mujoco.MjData(model)
+        data.ctrl[:] = 1.0
+        mujoco.mj_step(model, data, 500)
+        speeds.append(data.qvel[0])
+    assert speeds[1] == pytest.approx(speeds[0], rel=0.01) and speeds[2] == pytest.approx(speeds[0], rel=0.01)
+
+
+@pytest.mark.parametrize("own", ["", 'timeconst="0.1"', 'timeconst="0.1" delay="0.1" nsample="60"'])
+def test_a_lag_and_a_delay_add_to_those_of_the_actuator(own) -> None:
+    servo = f'<actuator><position name="servo" joint="hinge" kp="1" {own}/></actuator></mujoco>'
+    spec = mujoco.MjSpec.from_string(
+        f'{HEAD}<worldbody><body><joint name="hinge" axis="0 1 0"/>{LINK}</body></worldbody>{servo}'
+    )
+    before = spec.copy().compile()
+    model = _edited(_edited(spec, "actuator_lag", {"time_constant": 0.05}), "actuator_delay", {"delay": 0.02}).compile()
+    assert model.actuator_dynprm[0, 0] == pytest.approx(0.05 + (0.1 if own else 0.0))
+    assert model.actuator_delay[0] == pytest.approx(before.actuator_delay[0] + 0.02)
+    assert model.actuator_history[0, 0] > model.actuator_delay[0] / model.opt.timestep
+
+
+def test_a_muscle_has_no_lag_added() -> None:
+    spec = mujoco.MjSpec.from_string(
+        f'{HEAD}<worldbody><body><joint name="hinge" axis="0 1 0"/>{LINK}</body></worldbody>'
+        '<actuator><muscle name="m" joint="hinge" lengthrange="0.1 1"/></actuator></mujoco>'
+    )
+    with pytest.raises(ValueError, match="actuator_lag: actuator 'm' is not linear"):
+        _edited(spec, "actuator_lag", {"time_constant": 0.05})
+
+
+@pytest.mark.parametrize("dmax", [0.5, 0.95])
+def test_softness_is_the_same_of_a_contact_told_by_stiffness_and_damping(dmax) -> None:
+    """MuJoCo's b is 2 / (dmax time) or -solref[1] / dmax, its k 1 / (dmax time ratio)^2 or -solref[0] / dmax^2."""
+    told = mujoco.MjSpec.from_string(
+        f'<mujoco><worldbody><geom name="g" size="0.1" solref="{{}}" solimp="0.4 {dmax}"/></worldbody></mujoco>'.format(
+            f"{-1 / 0.02**2} {-2 / 0.02}"
+        )
+    )
+    soft = _edited(told, "contact_softness", {"time_constant": 0.02}).compile()
+    np.testing.assert_allclose(soft.geom_solref[0], [-1 / 0.04**2, -2 / 0.04])
+
+
+def test_a_contact_without_damping_is_not_softened() -> None:
+    spec = mujoco.MjSpec.from_string(
+        '<mujoco><worldbody><geom name="g" size="0.1" solref="-900 0"/></worldbody></mujoco>'
+    )
+    with pytest.raises(ValueError, match="the contacts of geom 'g' have no damping"):
+        _edited(spec, "contact_softness", {"time_constant": 0.02})
+
+
+@pytest.mark.parametrize("how", ["", 'inertiafromgeom="false"', 'inertiafromgeom="true"', 'inertiagrouprange="2 3"'])
+def test_a_load_weighs_what_it_does_however_masses_are_inferred(how) -> None:
+    inertial = '<inertial pos="0.2 0 0" mass="1" diaginertia="0.01 0.01 0.01"/>'
+    link = LINK.replace("<geom", '<geom group="3"')
+    body = f'<body name="arm"><joint name="hinge" axis="0 1 0"/>{inertial}{link}</body>'
+    scene = f"<mujoco><compiler {how}/><worldbody>{body}</worldbody></mujoco>"
+    spec = mujoco.MjSpec.from_string(scene)
+    edited = _edited(spec, "payload", {"mass": 2.0, "at": ["arm"]})
+    for model in (edited.compile(), mujoco.MjModel.from_xml_string(edited.to_xml())):
+        assert model.body_mass.sum() - spec.copy().compile().body_mass.sum() == pytest.approx(2.0)
 
 
 @pytest.mark.parametrize("plant", PLANTS)

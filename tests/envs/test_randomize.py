@@ -225,6 +225,27 @@ def test_what_effects_add_to_a_scene_is_not_drawn(make_backend, gap, task) -> No
         np.testing.assert_allclose(there[own:], np.array(getattr(backend.model, name))[own:])
 
 
+def test_a_gain_that_is_drawn_leaves_an_offset_where_it_is(make_backend) -> None:
+    """What is added to a servo's target, in radians, is the same for every gain."""
+    gap = {"actuator_offset": {"offset": 0.05, "at": ["position2"]}}
+    backend = make_backend("push", 8, effects_=gap, randomised=True)
+    backend.reset(np.arange(8))
+    drawn, second = _drawn(backend), backend.model.actuator("position2").id
+    offset = drawn["actuator_biasprm"][:, second, 0] / drawn["actuator_gainprm"][:, second, 0]
+    np.testing.assert_allclose(offset, 0.05)
+    assert np.ptp(drawn["actuator_gainprm"][:, second, 0]) > 0
+
+
+def test_damping_that_is_drawn_leaves_what_was_found_out(make_backend) -> None:
+    drawn = []
+    for gap in ({}, {"viscous_friction": {"coefficient": 800.0, "at": ["nail"]}}):
+        backend = make_backend("hammer", 4, effects_=gap, randomised=True)
+        backend.reset(np.arange(4))
+        drawn.append(_drawn(backend)["dof_damping"][:, backend.model.joint("nail").dofadr[0]])
+    assert 250 <= drawn[0].min() and drawn[0].max() <= 2500
+    np.testing.assert_allclose(drawn[1], 2 * drawn[0])
+
+
 def test_a_bare_name_is_a_list_of_one() -> None:
     (draw,) = randomize.load({"mass": {"fields": "body_mass", "at": "puck", "low": 1.0, "high": 2.0}})
     assert (draw.fields, draw.at) == (("body_mass",), ("puck",))

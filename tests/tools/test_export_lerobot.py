@@ -6,9 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
+from mpc_sgft.command import compose
+from mpc_sgft.diagnose.deployments.recordings import joint_columns
 from mpc_sgft.storage.episode_file import EpisodeWriter
+from tools import export_lerobot
 from tools.export_lerobot import WRITER, main, read_run, uv_run
 
 ROOT = Path(__file__).parents[2]
@@ -79,6 +83,15 @@ def test_every_feature_has_a_name_for_each_entry_and_the_puck_is_no_joint(run):
     sizes = {name: array.shape[1] for name, array in export.episodes[0].items()}
     assert {name: len(named) for name, named in export.header["names"].items()} == sizes
     assert export.header["names"]["joints.qvel"] == [f"joint{i}" for i in range(1, 8)]
+
+
+@pytest.mark.parametrize("task", ["push_towel", "rope_peg_in_hole", "hammer"])
+def test_joints_are_named_as_those_whose_columns_are_exported(task):
+    made = instantiate(compose.compose("evaluate", [f"task={task}"], []).task.env, _convert_="all")
+    named = export_lerobot.names(made, {"actuator_names": []})
+    for kind in ("qpos", "qvel"):
+        assert len(named[f"joints.{kind}"]) == len(joint_columns(made, kind))
+    assert named["joints.qpos"][:3] == ["joint1", "joint2", "joint3"]
 
 
 def test_aborted_and_cut_episodes_are_marked_or_left_out(run):

@@ -85,6 +85,11 @@ def test_what_is_there_is_kept_and_goes_on(record, stand_in: StandIn, tmp_path, 
     assert "1 pairs are there" in capsys.readouterr().out
     pairs = json.loads(file.read_text())["pairs"]
     assert pairs[:1] == first and [pair["image"] for pair in pairs] == ["00.png", "01.png"]
+    file.write_text(json.dumps(json.loads(file.read_text()) | {"pairs": pairs[1:]}))  # the first was a bad one
+    kept = (tmp_path / "pairs" / "01.png").read_bytes()
+    assert record(stand_in.ip, tmp_path / "pairs", "\nq\n") == 0
+    assert [pair["image"] for pair in json.loads(file.read_text())["pairs"]] == ["01.png", "02.png"]
+    assert (tmp_path / "pairs" / "01.png").read_bytes() == kept
 
 
 def test_a_robot_that_is_lost_costs_no_pair(record, robot_push: Push, tmp_path, monkeypatch, capsys) -> None:

@@ -159,6 +159,9 @@ def test_a_suspicion_must_lower_the_error(margin: float):
 def test_a_negative_excess_is_refused_and_without_a_gate_there_is_none():
     with pytest.raises(ValueError, match="gate_excess=-1.0 must be 0 or more"):
         make_sgft(gate_excess=-1.0)
+    for wrong in ({"gate_memory": 0}, {"gate_margin": 0.0}, {"average_decay": 1.0}, {"policy_share": 2.0}):
+        with pytest.raises(ValueError, match="{}={} must".format(*next(iter(wrong.items())))):
+            make_sgft(**wrong)
     assert make_sgft(gate_excess=2.0, gate=False).gate is None
 
 

@@ -399,6 +399,20 @@ def test_what_a_resumed_run_refuses_leaves_it_as_it_was(pretrained, deployed, tm
         assert (folder / "config.yaml").read_bytes() == (run / "config.yaml").read_bytes()
 
 
+def test_a_checkpoint_that_changed_since_is_said_before_anything_is_driven(pretrained, deployed, tmp_path):
+    began, folder = shutil.copytree(pretrained, tmp_path / "began"), shutil.copytree(deployed, tmp_path / "r")
+    cfg = OmegaConf.load(folder / "config.yaml")
+    cfg.checkpoint = str(began)
+    OmegaConf.save(cfg, folder / "config.yaml")
+    path = began / "checkpoint" / "model.safetensors"
+    model, meta = checkpoint.load(path)
+    next(model.encoder.parameters()).data += 0.01
+    checkpoint.save(path, model, meta)
+    done = here("deploy", "--resume", str(folder), "rollouts=5")
+    assert done.returncode == 2 and "is not the one that the run began with" in done.stderr, done.stderr
+    assert not (folder / "episodes" / "0005.mcap").exists()
+
+
 def test_a_corrupt_checkpoint_is_named(pretrained, tmp_path, capsys):
     bad = tmp_path / "bad.safetensors"
     bad.write_bytes((pretrained / "checkpoint" / "model.safetensors").read_bytes()[:-100])
