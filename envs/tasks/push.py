@@ -231,7 +231,8 @@ class Push(AbstractTask):
 
     def value_plane(self, points: int) -> ValuePlane:
         """V over the tip's place on the table with the puck in the middle of its range (the paper's Figure 7)."""
-        (x0, y0), (x1, y1), puck = WORKSPACE_LOW.tolist(), WORKSPACE_HIGH.tolist(), (0.2, 0.0)
+        (x0, y0), (x1, y1) = WORKSPACE_LOW.tolist(), WORKSPACE_HIGH.tolist()
+        puck = float(np.mean(self.puck_x)), float(np.mean(self.puck_y))
         x, y = np.meshgrid(np.linspace(x0, x1, points), np.linspace(y0, y1, points), indexing="ij")
         observation = np.stack([x.ravel(), y.ravel(), np.full(x.size, puck[0]), np.full(x.size, puck[1])], 1)
         axes = (("x", "m"), ("y", "m"))

@@ -56,6 +56,12 @@ def test_push_rewards_by_hand(make_task) -> None:
     assert task.fell(seen).tolist() == [False, False, False, True]
 
 
+def test_the_value_map_has_the_puck_in_the_middle_of_its_range(make_task) -> None:
+    plane = make_task("push").value_plane(3)
+    assert plane.marks == {"puck": pytest.approx((0.15, 0.0))} and (plane.observation[:, 2:] == [0.15, 0.0]).all()
+    assert plane.observation[0, :2].tolist() == [plane.extent[0], plane.extent[2]]
+
+
 def test_a_puck_that_goes_too_far_falls_where_the_table_ends(make_task) -> None:
     seen = np.array([[0.5, 0.0, 0.58, 0.0]])  # 5 mm past the goal line
     still, fell = (make_task("push", edge_x=x).reward(seen, np.zeros((1, 2))) for x in (0.75, 0.575))
