@@ -127,6 +127,7 @@ def test_a_cluster_that_lets_nobody_in_is_one_line(tmp_path: Path) -> None:
     assert "Ray could not join that cluster" in done.stderr and "asks for a token" in done.stderr
 
 
+@pytest.mark.ci
 def test_a_cluster_that_is_there_is_joined_and_left_as_it_was(tmp_path: Path) -> None:
     """A process of its own has the cluster, another one pretrains on it; the first one sees its workers come and go."""
     line, own = [sys.executable, "-c", HEAD], {k: v for k, v in os.environ.items() if k != "RAY_AUTH_MODE"}
@@ -155,6 +156,7 @@ def test_a_cluster_that_is_there_is_joined_and_left_as_it_was(tmp_path: Path) ->
         assert head.wait(timeout=60) == 0
 
 
+@pytest.mark.ci
 def test_a_pretraining_that_loses_a_worker_learns_the_same(tmp_path: Path) -> None:
     """One worker is killed in the middle; every number is that of a run in processes of this machine."""
     words = ["task=pendulum", "+experiment=debug", "transitions=3000", "collector.workers=2", "log.tensorboard=false"]
@@ -218,6 +220,7 @@ def test_a_worker_that_cannot_start_is_one_line(cluster, monkeypatch: pytest.Mon
     assert "\n" not in str(found.value)
 
 
+@pytest.mark.ci
 def test_ctrl_c_leaves_no_process_behind(tmp_path: Path) -> None:
     words = ["task=pendulum", "+experiment=debug", "collector=ray", "transitions=1000000", f"run_dir={tmp_path / 'r'}"]
     line = [sys.executable, "-m", "mpc_sgft.pretrain", "--quiet", *words, "log.tensorboard=false"]
