@@ -15,7 +15,7 @@ APT := mesa-vulkan-drivers libegl1 libegl-mesa0 libgl1-mesa-dri libosmesa6 libus
 
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: help setup system packages robot client launcher demo test-setup test test-ci test-all docs check format clean
+.PHONY: help setup system packages robot client launcher demo test-setup test test-all docs check format clean
 
 help: ## List the targets.
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -63,15 +63,14 @@ client: setup
 	@[ "$$(uname -s)" != Linux ] || $(MAKE) --no-print-directory robot \
 	  || echo "the robot's client could not be installed: its tests are left out, its types unknown"
 
+# Alone: for AWS it wants an older cloudpickle than joblib does, so that no lock can hold both.
 launcher: setup
 	@$(BIN)/python -c 'import hydra_plugins.hydra_ray_launcher' 2> /dev/null \
-	  || $(BIN)/python -m pip install -q --no-deps hydra-ray-launcher==1.2.2
+	  || $(BIN)/python -m pip install -q --no-deps hydra-ray-launcher==1.2.2 \
+	  || echo "Ray's launcher could not be installed: its test is left out"
 
 test: test-setup ## Set up what the tests need, and run the fast ones.
-	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n $(WORKERS) -m "not slow and not ci" $(TESTS)
-
-test-ci: test-setup ## Run the tests of more than ten seconds that `make test` leaves to continuous integration.
-	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n $(WORKERS) -m "ci and not slow" $(TESTS)
+	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n $(WORKERS) -m "not slow" $(TESTS)
 
 test-all: test-setup ## Run every test, the slow ones too.
 	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n $(WORKERS) $(TESTS)

@@ -29,7 +29,6 @@ def test_the_line_counts_by_need() -> None:
     assert unknown == ["tired"] and left_out([]) == ("", [])
 
 
-@pytest.mark.ci
 @pytest.mark.parametrize("workers", ["0", "2"])
 @pytest.mark.parametrize(("allowed", "code"), [(None, 0), ("a GPU, a renderer", 0), ("a GPU", 1)])
 def test_what_may_not_be_missing_fails_the_run(tmp_path: Path, allowed: str | None, code: int, workers: str) -> None:

@@ -52,9 +52,8 @@ def record(robot_ip: str, serial: str, folder: Path, recording: Path | None = No
             if np.abs(state.dq).max() > AT_REST:
                 print("the robot moves; wait until it rests")
                 continue
-            name = next(
-                n for n in map("{:02d}.png".format, count()) if not (folder / n).exists()
-            )  # pairs may be left out
+            unused = (n for n in map("{:02d}.png".format, count()) if not (folder / n).exists())
+            name = next(unused)  # pairs may have been left out
             _save(folder / name, _fresh(camera))
             pairs.append({"base_T_hand": np.asarray(state.O_T_EE.matrix).tolist(), "image": name})
             whole = {"serial": camera.serial, "intrinsics": asdict(camera.intrinsics), "pairs": pairs}

@@ -188,12 +188,12 @@ class Deployment:
             self.verdicts.remember()
         self.operator.enter("measuring", number)
         metrics = self._measure(rollout, number)
-        valid = rollout.steps[~rollout.steps["next", "invalid"][:, 0]]
-        if len(valid) >= self.transfer.slice_len and not rollout.intervened:
+        lesson = rollout.lesson(self.transfer.slice_len)
+        if lesson is not None:
             self.operator.enter("training", number)
             with self.watch("learn"):
                 warm_up = number <= self.cfg.warmup
-                metrics |= self.transfer.learn(valid, self.operator.track, success=rollout.success, warm_up=warm_up)
+                metrics |= self.transfer.learn(lesson, self.operator.track, success=rollout.success, warm_up=warm_up)
             self.state["updates"] += 0 if self.transfer.stays else self.transfer.method.updates
         else:
             self.transfer.interrupt()

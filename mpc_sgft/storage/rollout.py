@@ -51,6 +51,11 @@ class Rollout(NamedTuple):
     keys: tuple[Press, ...] = ()
     intervened: bool = False
 
+    def lesson(self, least: int) -> TensorDict | None:
+        """What is learned from: the valid steps; None if they are fewer than `least`, or a person had the arm."""
+        valid = self.steps[~self.steps["next", "invalid"][:, 0]]
+        return valid if len(valid) >= least and not self.intervened else None
+
 
 def from_episode(episode: Episode, number: int) -> Rollout:
     """A rollout from its recording; one that was cut off counts as aborted, and its whole steps are kept.

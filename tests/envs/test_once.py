@@ -10,7 +10,6 @@ SHORT = {"push": 0.01, "push_ball": 0.03}  # [m] before the line, where what is 
 EPISODES = {"push": 32, "hammer": 32, "insert": 32, "push_towel": 12, "push_ball": 12}
 
 
-@pytest.mark.ci
 @pytest.mark.parametrize("name", list(EPISODES))
 def test_who_knows_the_gap_closes_it(make_backend, name: str) -> None:
     gap = yaml.safe_load((CONFIGS / f"gap/{name}_once.yaml").read_text())["effects"]

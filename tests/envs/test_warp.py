@@ -73,7 +73,6 @@ def test_contacts_amplify_the_last_digit_in_mujoco_too(make_backend) -> None:
     assert np.abs(ends[0] - ends[1]).max() > 1 * MM
 
 
-@pytest.mark.ci
 def test_an_episode_ends_alike(both) -> None:
     """Each world's own policy acts on what it sees."""
     ends = []

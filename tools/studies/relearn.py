@@ -73,11 +73,11 @@ def relearn(cfg: DictConfig, rollouts: list[Rollout], at: list[int]) -> tuple[Tr
     success = {}
     bar = progress(len(rollouts), initial=0, desc="relearn", unit="rollout", disable=False)
     for count, rollout in enumerate(rollouts, 1):
-        valid = rollout.steps[~rollout.steps["next", "invalid"][:, 0]]
-        if len(valid) >= transfer.slice_len and not rollout.intervened:
-            transfer.learn(valid, success=rollout.success, warm_up=count <= cfg.warmup)
-        else:
+        lesson = rollout.lesson(transfer.slice_len)
+        if lesson is None:
             transfer.interrupt()
+        else:
+            transfer.learn(lesson, success=rollout.success, warm_up=count <= cfg.warmup)
         bar.update(1)
         if count in at:
             seed = evaluation_seed(cfg)

@@ -87,7 +87,6 @@ ODD: dict[str, Callable[[Columns], Columns]] = {
 }
 
 
-@pytest.mark.ci
 @pytest.mark.parametrize("seed", [0, 1])
 @pytest.mark.parametrize("odd", ODD)
 def test_a_verdict_or_one_clear_line(odd: str, seed: int, tmp_path: Path) -> None:

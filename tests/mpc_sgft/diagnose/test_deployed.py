@@ -60,7 +60,6 @@ def test_nothing_is_trained_on_a_part_of_what_is_missing(deployed, capsys) -> No
     assert (run / "diagnosis" / "effects.yaml").exists() and not (run / "diagnosis" / "pretrain").exists()
 
 
-@pytest.mark.ci
 def test_ice_is_named_by_how_far_the_puck_slides(deployed) -> None:
     run = deployed({"contact_friction": {"coefficient": 0.05, "at": ["puck"]}}, episodes=5)
     found = diagnose_run(run, effects=["actuator_gain", "contact_friction"])
@@ -74,7 +73,6 @@ def test_ice_is_named_by_how_far_the_puck_slides(deployed) -> None:
     assert not any(law.where.startswith("drive") for law in found.laws.laws), "commands reach the servos as they are"
 
 
-@pytest.mark.ci
 def test_one_joint_is_told_from_all_by_its_force(deployed, tmp_path: Path) -> None:
     run, out = deployed({"coulomb_friction": {"torque": 2.0, "at": ["joint4"]}}), tmp_path / "out"
     named = diagnose_run(run, effects=["coulomb_friction", "actuator_gain"], max_effects=2, out=out).as_dict()

@@ -25,7 +25,6 @@ FEW = ["viscous_friction", "coulomb_friction", "quadratic_drag", "actuator_offse
 Record = Callable[..., Path]
 
 
-@pytest.mark.ci
 def test_a_trace_beside_the_cause_is_listed_and_not_named(
     slide: Path, record: Record, tmp_path: Path, check_report: Callable[[dict], None]
 ) -> None:

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
-import pytest
 import yaml
 
 from envs.effects import load
@@ -56,7 +55,6 @@ def test_a_wrong_mass_is_refitted_and_not_called_an_effect(slide, record) -> Non
     assert abs(report["nominal_refit"]["mass cart"]["factor"] - 5.8 / 5.0) < 0.005
 
 
-@pytest.mark.ci
 def test_a_surface_that_is_slipperier_is_told_from_a_dry_joint_by_pressing(tmp_path: Path) -> None:
     model = mujoco.MjModel.from_xml_string(SANDER)
     model.opt.timestep, model.geom_friction[:, 0] = 2e-4, 0.3

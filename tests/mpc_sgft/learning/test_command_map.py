@@ -288,7 +288,6 @@ def test_few_causes_are_preferred_where_commands_look_alike(weight: float) -> No
     assert off < 0.2 if weight else off > 0.35
 
 
-@pytest.mark.ci
 @pytest.mark.parametrize("mapped", [True, False])
 def test_tdmpc2_may_be_given_a_command_map(mapped: bool) -> None:
     """Its own loss finds a turned gain, where the dynamics may hardly move; without the map the error stays."""

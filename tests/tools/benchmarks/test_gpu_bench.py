@@ -12,7 +12,6 @@ import torch
 from tools.benchmarks import gpu_bench
 
 
-@pytest.mark.ci
 def test_it_writes_a_row_for_everything(tmp_path: Path) -> None:
     out = tmp_path / "bench.csv"
     words = ["--device", "cpu", "--sizes", "small", "--envs", "2", "--physics", "mujoco", "--repeats", "1"]
@@ -27,7 +26,6 @@ def test_it_writes_a_row_for_everything(tmp_path: Path) -> None:
     assert float(rows[-1]["per_second"]) == pytest.approx(80e3 / float(rows[-1]["median_ms"]), rel=0.1)
 
 
-@pytest.mark.ci
 def test_fine_tuning_is_measured_once_on_a_processor(tmp_path: Path) -> None:
     out = tmp_path / "bench.csv"
     few = ["rollouts=1", "eval_every=1", "eval_episodes=1", "method.updates=1", "method.gate=false", "log.rerun=false"]

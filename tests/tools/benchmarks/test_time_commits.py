@@ -35,7 +35,6 @@ def commit(git, subject: str) -> str:
     return git("rev-parse", "--short=7", "HEAD")
 
 
-@pytest.mark.ci
 def test_each_commit_is_timed_with_its_own_numbers(git, tmp_path):
     before = commit(git, "A plan of four iterations")
     planner = time_commits.ROOT / "configs" / "planner" / "mppi.yaml"

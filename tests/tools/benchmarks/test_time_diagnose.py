@@ -8,7 +8,6 @@ import pytest
 from tools.benchmarks import time_diagnose
 
 
-@pytest.mark.ci
 def test_rows_and_ratios(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(time_diagnose, "PARTS", (2,))
     case = tmp_path / "case"

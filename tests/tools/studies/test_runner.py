@@ -28,7 +28,6 @@ def test_a_run_is_made_once_and_resumed_if_cut_off(tmp_path):
     assert (run / "checkpoint" / "state.pt").stat().st_mtime_ns == stamp  # nothing is trained again
 
 
-@pytest.mark.ci
 def test_a_launcher_starts_a_run_elsewhere(tmp_path):
     """submitit's own local executor: a process of its own, as on a cluster that runs SLURM."""
     pytest.importorskip("hydra_plugins.hydra_submitit_launcher", reason="needs submitit")
@@ -46,7 +45,6 @@ def test_a_launcher_starts_a_run_elsewhere(tmp_path):
         finished("evaluate", tmp_path / "begun", words, launcher)
 
 
-@pytest.mark.ci
 def test_runs_are_jobs_on_a_ray_cluster(tmp_path):
     pytest.importorskip("hydra_plugins.hydra_ray_launcher", reason="needs Ray's launcher")
     few = "+hydra.launcher.ray.init.num_cpus=1"

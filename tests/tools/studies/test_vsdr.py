@@ -31,7 +31,6 @@ def test_both_halves_count_alike() -> None:
     assert vsdr.foretells(rows, "score") == 1.0 and vsdr.foretells(rows, "distance") > 0
 
 
-@pytest.mark.ci
 def test_a_checkpoint_that_forgot_comes_last(tmp_path: Path, capsys) -> None:
     run = tmp_path / "run"
     words = ["task=push", "method=zero_shot", "rollouts=1", "eval_episodes=1", "log.rerun=false", "quiet=true"]

@@ -3,12 +3,9 @@
 import csv
 from pathlib import Path
 
-import pytest
-
 from tools.studies import zero_shot
 
 
-@pytest.mark.ci
 def test_a_row_a_method_gap_and_seed_and_none_is_measured_twice(tmp_path: Path, capsys) -> None:
     table, folder = tmp_path / "found.csv", ["--runs", str(tmp_path / "runs")]
     words = [str(table), "--gaps", "mild", *folder, "--set", "+experiment=debug", "transitions=640", "--methods", "dr"]

@@ -211,7 +211,6 @@ def pushed(moved: Callable, tmp_path: Path) -> tuple[Path, list[Path]]:
     return write_dataset(tmp_path / "slides", told, names, fps=250, files=(0, 0)), csv
 
 
-@pytest.mark.ci
 def test_the_same_answer_as_from_csv(
     pushed: tuple[Path, list[Path]], slide: Path, tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:

@@ -319,7 +319,6 @@ def slide_bag(path: Path, columns: dict[str, np.ndarray]) -> Path:
     return write_bag(path, rows)
 
 
-@pytest.mark.ci
 def test_the_same_answer_as_from_csv(
     moved: Callable, slide: Path, tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:

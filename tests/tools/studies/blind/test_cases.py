@@ -56,7 +56,6 @@ def test_the_search_finds_where_the_change_equals_the_noise() -> None:
     assert np.isnan(found[2])
 
 
-@pytest.mark.ci
 def test_data_are_reproducible_and_labels_are_sealed(tmp_path: Path) -> None:
     few = [c._replace(seconds=0.6) for c in draw(3, 60) if c.plant == "slide" and c.group == "single"][:1]
     first, second = make(few), make(few)

@@ -35,7 +35,6 @@ def solver(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
     return asked
 
 
-@pytest.mark.ci
 def test_generate_run_score_and_resume(
     tmp_path: Path, solver: list[Path], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
