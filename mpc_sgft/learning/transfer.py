@@ -281,18 +281,18 @@ def mean_error(model: WorldModel, episodes: TensorDict, horizon: int) -> float:
 
 @torch.inference_mode()
 def open_loop_error(model: WorldModel, steps: TensorDict, horizon: int) -> Tensor:
-    """Squared latent error of imagining the taken actions, [T, H]; nan where the episode ended before.
+    """Squared latent error of imagining the taken actions, [T, H]; nan where the episode had ended, or failed, before.
 
     Args:
         model: Whose dynamics.
-        steps: One episode, [T].
+        steps: One episode, [T]; the last may be `invalid`: nothing was seen after it.
         horizon: H, steps imagined from each step.
     """
-    device = next(model.parameters()).device
-    action = steps["action"].to(device)
-    target = model.encode(steps["next", "observation"].to(device))
-    z, count = model.encode(steps["observation"].to(device)), len(steps)
-    error = torch.full((count, horizon), torch.nan, device=device)
+    device, count = next(model.parameters()).device, int((~steps["next", "invalid"]).sum())
+    action = steps["action"][:count].to(device)
+    target = model.encode(steps["next", "observation"][:count].to(device))
+    z = model.encode(steps["observation"][:count].to(device))
+    error = torch.full((len(steps), horizon), torch.nan, device=device)
     for h in range(min(horizon, count)):
         z = model.next(z[: count - h], action[h:])
         error[: count - h, h] = (z - target[h:]).square().mean(-1)

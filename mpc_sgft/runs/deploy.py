@@ -173,6 +173,9 @@ class Deployment:
             if self.stop.asked or self.operator.stopping:
                 raise Stopped(self.how_to_go_on())
         self._before(table)  # without any rollout
+        if self.state["rollouts"] not in self.state["scores"]:  # it was to be longer when the last one was driven
+            self.evaluate(table, {})
+            self.save()
         bar.close()
         return self._finish()
 

@@ -48,6 +48,8 @@ def make_env(cfg: DictConfig, place: Place | None = None) -> ControlEnv:
         raise UserError("a gap is what a simulator lacks; the robot has its own. Leave gap= out with --backend franka.")
     settings: Any = OmegaConf.to_container(cfg.backend, resolve=True)
     ip, clock = settings["robot_ip"], settings["clock"]
+    if not cfg.rollouts and not settings["dry_run"]:
+        raise UserError("rollouts=0: on a robot its rollouts are all that is measured. Give one or more.")
     if ip is None:
         raise UserError("--backend franka needs --robot-ip IP, or --robot-ip stand-in to rehearse without a robot.")
     if cfg.perception.name == "stand_in" and ip != STAND_IN:

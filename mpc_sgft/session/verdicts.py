@@ -18,6 +18,7 @@ class CountedRun(Protocol):
         transfer: What learns, with `state_dict`, `load_state_dict` and `correct`.
         metrics: Of the last rollout.
         judge: Evaluation episodes on the side; None where the real rollouts are the measure.
+        viewer: Shows the rollouts that count; None: nothing does.
     """
 
     folder: Path
@@ -25,6 +26,7 @@ class CountedRun(Protocol):
     transfer: Any
     metrics: dict[str, float]
     judge: Any
+    viewer: Any
     operator: Operator
     logger: MetricLogger
 
@@ -120,6 +122,8 @@ class Verdicts:
         run.save()  # first: if the process is killed here, the recording is there and counts
         set_aside(run.path(number))
         forget_audit(run.folder / "audit.csv", number)
+        if run.viewer:
+            run.viewer.correct(None)
         run.logger.close()
         run.logger = run.make_logger(number - 1)
         run.show_counts()
@@ -131,6 +135,8 @@ class Verdicts:
         outcomes[-1] = (success, outcomes[-1][1])
         run.state["successes"] = sum(s for s, _ in outcomes)
         run.transfer.correct(number, success)
+        if run.viewer:
+            run.viewer.correct(success)
         measured = dict[str, float]()
         if run.judge is None and run.state["scores"].pop(number, None) is not None:
             run.evaluate(None, measured)

@@ -89,6 +89,10 @@ class DeployViewer:
         """Add the success of an evaluation."""
         self.viewer.metrics(self.viewer.env_step, {"success": share})
 
+    def correct(self, success: bool | None) -> None:
+        """What the last rollout counts as after all; None: it is driven again."""
+        self.viewer.correct(success)
+
     def close(self) -> None:
         self.viewer.close()
 

@@ -41,6 +41,7 @@ from mpc_sgft.views.value_image import log_value_map
 __all__ = ["Candidates", "EpisodeView", "Layout", "RunViewer"]
 
 RRD_MAGIC, RRD_HEADER = b"RRF", 12  # how a file begins; bytes before its first frame
+NOT_COUNTED = "does not count: it is driven again"
 NOT_DRAWN = " (not drawn: this file is bounded by log.rerun_mb)"
 RRD_FRAME, RRD_FOOTER = struct.Struct("<QQ"), 0  # kind and length of a frame; the kind after the last message
 
@@ -122,6 +123,16 @@ class RunViewer:
         self._step, self._episode = last + 1, self._episode + 1
         self._flush()
 
+    def correct(self, success: bool | None) -> None:
+        """Say of the last episode what it counts as after all: it reached its goal, or not; None: it does not count."""
+        number = self._episode - 1
+        counts = {True: "counts as a success", False: "counts as no success", None: NOT_COUNTED}[success]
+        self._recording.set_time("env_step", sequence=self._step - 1)
+        self._recording.set_time("episode", sequence=number)
+        self._recording.log("episodes", rr.TextLog(f"{number} {counts}", level=rr.TextLogLevel.INFO))
+        self._recording.log("success", rr.Scalars(math.nan if success is None else float(success)))
+        self._flush()
+
     def _every(self) -> int:
         """One of how many episodes is drawn now."""
         free = 1.0 if self._limit is None else 1 - self.path.stat().st_size / self._limit
@@ -201,13 +212,19 @@ class RunViewer:
     def _take_over(self, chunks: list[Chunk]) -> None:
         """Send what an earlier file held and go on counting where it stopped."""
         self._recording.send_chunks(chunks)
+        titles, lines = dict[str, str](), list[str]()
         for chunk in chunks:
             if chunk.entity_path == "/episodes":
                 batch = chunk.to_record_batch()
                 self._step = max(self._step, *(row + 1 for row in batch.column("env_step").to_pylist()))
                 self._episode = max(self._episode, *(row + 1 for row in batch.column("episode").to_pylist()))
-                said = itertools.chain(*batch.column("TextLog:text").to_pylist())
-                self.earlier |= {text.partition(". ")[2].removesuffix(NOT_DRAWN) for text in said}
+                lines += itertools.chain(*batch.column("TextLog:text").to_pylist())
+        for text in lines:
+            number, shown, rest = text.partition(": ")
+            if shown and number.isdecimal():
+                titles[number] = rest.partition(". ")[2].removesuffix(NOT_DRAWN)
+        taken_back = {text.removesuffix(f" {NOT_COUNTED}") for text in lines if text.endswith(NOT_COUNTED)}
+        self.earlier = {title for number, title in titles.items() if number not in taken_back}
 
     def _flush(self) -> None:
         """Put everything so far into the file."""

@@ -101,6 +101,12 @@ def test_open_loop_error_by_hand():
     expected = (z - model.encode(data["next", "observation"][2:3])).square().mean()
     assert torch.isclose(error[1, 1], expected)
     assert error[3, 1:].isnan().all() and not error[:2].isnan().any()
+    data["next", "invalid"][-1] = True  # nothing was seen after it
+    failed = open_loop_error(model, data, 3)
+    torch.testing.assert_close(failed[:3], open_loop_error(model, data[:3], 3), equal_nan=True)
+    assert failed.shape == error.shape and failed[3].isnan().all() and failed[2, 1:].isnan().all()
+    data["next", "invalid"][:] = True
+    assert open_loop_error(model, data, 3).isnan().all()
 
 
 def test_the_latent_carries_past_commands_exactly():

@@ -21,6 +21,7 @@ def config(*given: str):
     ("given", "words"),
     [
         ((), "needs --robot-ip"),
+        (("robot-ip=stand-in", "rollouts=0"), "rollouts=0: on a robot its rollouts are all that is measured"),
         (("robot-ip=10.0.0.1",), "sees the stand-in's scene alone"),
         (("robot-ip=stand-in", "perception=fixed"), "no camera"),
         (("robot-ip=10.0.0.1", "perception=fixed", "backend.clock=robot"), "needs real time"),

@@ -20,6 +20,7 @@ from mpc_sgft.session.operator import Nobody
 from mpc_sgft.storage import checkpoint
 from mpc_sgft.storage.episode_file import EpisodeWriter, read_episode
 from mpc_sgft.storage.rollout import Press, from_episode
+from tests.mpc_sgft.views.test_viewer import columns
 
 pytestmark = pytest.mark.xdist_group("verdicts")  # what the file shares is made once
 
@@ -137,6 +138,50 @@ def test_what_is_left_of_a_session_goes_on_with_more_rollouts(tmp_path):
     checkpoint.save_state(path, state)
     with pytest.raises(UserError, match="an earlier version wrote it"):
         go_on(folder, None)
+
+
+@pytest.mark.parametrize("judged", [True, False])
+def test_a_run_that_ends_earlier_than_it_was_told_is_measured_at_its_end(tmp_path, monkeypatch, judged):
+    drive = deploy.drive
+
+    def broken(*args, number: int, **more):
+        if number == 3:
+            raise RuntimeError("the line is dead")
+        return drive(*args, number=number, **more)
+
+    monkeypatch.setattr(deploy, "drive", broken)
+    with pytest.raises(RuntimeError, match="the line is dead"):
+        run(tmp_path / "r", None, "rollouts=4", "eval_every=4", judged=judged)
+    monkeypatch.setattr(deploy, "drive", drive)
+    ours = loop(resumed.resume("deploy", str(tmp_path / "r"), ["rollouts=2"], ["rollouts=2"]), None, judged)
+    theirs = run(tmp_path / "whole", None, "rollouts=2", "eval_every=4", judged=judged)
+    assert ours["curve"] == theirs["curve"] and set(ours["curve"]) == ({"0", "2"} if judged else {"2"})
+    assert ours["evaluation_episodes"] == theirs["evaluation_episodes"] == 2
+
+
+def test_what_the_viewer_was_shown_is_taken_back_or_corrected(tmp_path, monkeypatch):
+    def texts(folder: Path) -> list[str]:
+        return [text for (text,) in columns(folder / "run.rrd")["/episodes"]["TextLog:text"]]
+
+    run(tmp_path / "m", Script({("resetting", 1): ["success"]}), "log.rerun=true")
+    assert texts(tmp_path / "m")[1] == "0 counts as a success"
+    assert columns(tmp_path / "m" / "run.rrd")["/success"]["Scalars:scalars"][:2] == [[0.0], [1.0]]
+    measure, measured = deploy.Deployment._measure, []
+
+    def killed(self, rollout, number):
+        measured.append(number)
+        if measured == [1, 1]:
+            raise RuntimeError("killed")
+        return measure(self, rollout, number)
+
+    monkeypatch.setattr(deploy.Deployment, "_measure", killed)
+    with pytest.raises(RuntimeError, match="killed"):
+        run(tmp_path / "r", Script({("resetting", 1): ["rerecord"]}), "log.rerun=true")
+    monkeypatch.undo()
+    loop(resumed.resume("deploy", str(tmp_path / "r"), [], []), None, judged=True)
+    said = texts(tmp_path / "r")
+    assert said[1] == "0 does not count: it is driven again"
+    assert [text.partition(". ")[2] for text in said if ". " in text] == ["rollout 1", "rollout 1", "rollout 2"]
 
 
 def test_what_a_rollout_that_breaks_down_leaves_behind(tmp_path, monkeypatch):
