@@ -117,7 +117,7 @@ def features(episode: Episode, task: AbstractTask, *, only_complete: bool) -> tu
     if any(key not in joints for key in ("time", *JOINTS.values())):
         return {}, [*notes, "left out, it has no joint samples"]
     count = len(data["step"])
-    begins = data["time"] - task.control_dt
+    begins = np.concatenate([[0.0], data["time"][:-1]])
     away = np.abs(joints["time"][None] - begins[:, None])  # [T, S]
     if (worst := away.min(1).max()) > task.control_dt / 2:
         notes.append(f"the nearest joint sample is up to {worst:.2f} s away")

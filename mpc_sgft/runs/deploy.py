@@ -119,8 +119,10 @@ class Deployment:
         self.state: dict[str, Any] = {"rollouts": 0, "aborted": 0, "scores": {}, "seconds": 0.0, "successes": 0}
         self.state |= {"interventions": 0, "rerecorded": 0, "updates": 0}
         self.state["outcomes"] = []  # (success, return) of each real rollout
+        self.state["reports"] = []  # of the robot, one each session, as it was last saved
         self.watch = Stopwatch("rollout", "learn", "evaluate")
         self.state["spent"] = self.watch.spent
+        self.earlier: list[dict[str, Any]] = []  # reports of the sessions before this one
         if cfg.resume is not None:
             self._resume()
             if agent.frozen_hash() != self.frozen:
@@ -339,6 +341,8 @@ class Deployment:
     def save(self) -> None:
         """Weights and exact state."""
         self.state |= {"seconds": time.monotonic() - self.began, "spent": self.watch.spent}
+        if self.judge is None:
+            self.state["reports"] = [*self.earlier, self.env.backend.report()]  # type: ignore[attr-defined]
         path = self.folder / "checkpoint"
         meta = checkpoint.describe(self.cfg, self.transfer.acting)
         checkpoint.save(path / "model.safetensors", self.transfer.acting, meta)
@@ -358,6 +362,7 @@ class Deployment:
                     f"rollouts={self.cfg.rollouts}: {self.cfg.resume} has {done} already. Give as many or more."
                 )
             self.state |= stored["loop"]
+            self.earlier = list(self.state["reports"])
             self.transfer.load_state_dict(stored["transfer"])
 
     def _finish(self) -> dict[str, Any]:
@@ -391,6 +396,7 @@ class Deployment:
             "wall_seconds": round(time.monotonic() - self.began, 1),
             "seconds": self.watch.rounded(),
             "robot": self.env.backend.report() if self.judge is None else None,
+            "robot_before": self.earlier,
             "rrd": str(self.folder / "run.rrd") if self.viewer else None,
         }
         run_folder.write_summary(self.folder, summary)

@@ -77,7 +77,11 @@ def drive(
             action = plan.action.cpu() + noise * torch.randn(plan.action.shape, generator=noise_generator)
             state["action"] = action.clamp(-1, 1)
             row, state = _step(env, state, number, t)
-            writer.step({**_transition(row, t, task.control_dt), "note": env.backend.note}, env.backend.samples())
+            samples = env.backend.samples()
+            end = (
+                (t + 1) * task.control_dt if samples is None else float(samples["time"][-1])
+            )  # a robot may have waited
+            writer.step({**_transition(row, t, end), "note": env.backend.note}, samples)
             listen(writer)
             operator.tell(step=f"{t + 1} of {task.episode_steps}", note=env.backend.note)
             rows.append(row[0])
@@ -137,13 +141,13 @@ def _step(env: ControlEnv, state: TensorDict, number: int, t: int) -> tuple[Tens
     return before, after.clone()
 
 
-def _transition(row: TensorDict, t: int, control_dt: float) -> dict[str, Any]:
-    """One control step as the recording wants it."""
+def _transition(row: TensorDict, t: int, end: float) -> dict[str, Any]:
+    """One control step as the recording wants it; `end` [s] since the episode's start."""
     following = row.get("next")
     flat = {key: following[key][0, 0].item() for key in ("reward", "terminated", "truncated", "success", "invalid")}
     return {
         "step": t,
-        "time": (t + 1) * control_dt,
+        "time": round(end, 9),
         "observation": row["observation"][0].numpy(),
         "next_observation": following["observation"][0].numpy(),
         "action": row["action"][0].numpy(),

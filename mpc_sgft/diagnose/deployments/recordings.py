@@ -92,11 +92,16 @@ def read_deployment(run: Path) -> Deployment:
     """Task and episodes of a run folder; of its config, only the task is read.
 
     Raises:
-        UserError: If the folder is not that of a deployment, or holds no usable episode.
+        UserError: If the folder is not that of a deployment in simulation, or holds no usable episode.
     """
-    task_cfg = run_config(run).task.env
+    cfg = run_config(run)
+    if OmegaConf.select(cfg, "backend.name") == "franka":
+        raise UserError(
+            f"--run {run}: an FR3 or its stand-in drove it. --run knows the table and the controller of --backend sim "
+            f"alone. Give what the arm recorded to a model of the arm: --model ARM.xml --data {run}/episodes/*.mcap"
+        )
     with from_config("task"):
-        task: AbstractTask = instantiate(task_cfg, _convert_="all")
+        task: AbstractTask = instantiate(cfg.task.env, _convert_="all")
     kept = lambda p: len(p.suffixes) == 1  # noqa: E731  # neither .empty.mcap nor .rerecorded.mcap
     paths = sorted(filter(kept, (run / "episodes").glob("*.mcap")))
     if not paths:
@@ -138,8 +143,7 @@ def as_rollout(name: str, episode: Episode, task: AbstractTask) -> Rollout:
     broken = np.flatnonzero(np.asarray(data.get("invalid", np.zeros(len(data["step"])))))
     steps = int(broken[0]) if len(broken) else len(data["step"])
     columns = {kind: joint_columns(task, kind) for kind in ("qpos", "qvel")}
-    end = steps * task.control_dt + 1e-9
-    whole = joints["time"] <= end
+    whole = joints["time"] <= (data["time"][steps - 1] if steps else 0.0) + 1e-9
     arrays: dict[str, Any] = {
         "q": joints["qpos"][:, columns["qpos"]],
         "v": joints["qvel"][:, columns["qvel"]],

@@ -246,6 +246,9 @@ def test_folders_that_are_no_deployment(tmp_path: Path, deployed) -> None:
     (tmp_path / "config.yaml").write_text("command: deploy\n")
     with pytest.raises(UserError, match="names no task"):
         read_deployment(tmp_path)
+    (tmp_path / "config.yaml").write_text("command: deploy\nbackend: {name: franka}\ntask: {env: {}}\n")
+    with pytest.raises(UserError, match="an FR3 or its stand-in drove it.* --model ARM.xml --data"):
+        read_deployment(tmp_path)
     run = deployed({}, episodes=1, steps=3)
     with pytest.raises(UserError, match="no episode has 10 whole steps. 0001.mcap: only 3 whole steps"):
         read_deployment(run)

@@ -35,6 +35,8 @@ def test_a_dry_run_does_everything_but_move(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     found, recording = summary(tmp_path), read_episode(tmp_path / "episodes" / "dry_run.mcap")
     assert found["dry_run"] and found["aborted"] is None and found["steps"] == STEPS
+    time, sampled = recording.transitions["time"], recording.joints["time"]
+    assert (np.diff(time) > 0).all() and time[-1] == pytest.approx(sampled[-1], abs=1e-6)  # one clock for both
     moved = recording.joints["qpos"].max(0) - recording.joints["qpos"].min(0)
     assert (moved < 0.01).all() and (abs(recording.transitions["action"]) > 0.1).any()  # [rad]
 
@@ -83,6 +85,7 @@ def test_a_killed_session_loses_no_row_and_goes_on(tmp_path: Path) -> None:
     found = summary(tmp_path)
     assert found["real_rollouts"] == 2 and found["aborted_rollouts"] == 1
     assert found["robot"]["faults"] == 0 and found["robot"]["periods"] == STEPS
+    assert found["robot_before"] == []  # the session that was killed had saved nothing
     assert list(read_episode(first).transitions["step"]) == list(kept.transitions["step"])
 
 

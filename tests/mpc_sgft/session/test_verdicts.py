@@ -29,6 +29,9 @@ SMALL = [f"task.env.episode_steps={STEPS}", "planner=policy", "method.updates=3"
 SMALL += ["log.tensorboard=false", "log.rerun=false", "train.replay.batch_size=8", "rollouts=2", "method.gate=false"]
 
 
+SESSIONS: list[int] = []
+
+
 class Script:
     """An operator whose keys are known beforehand: (phase, episode) -> words, each once; and answers to questions."""
 
@@ -65,7 +68,9 @@ def go_on(folder: Path, operator: Script | None, *more: str) -> dict:
 def loop(cfg: DictConfig, operator: Script | None, judged: bool) -> dict:
     agent, _ = build.load_agent(cfg)
     env, judge = build.make_env(cfg, 1), build.make_env(cfg, 2) if judged else None
-    env.backend.report = dict  # as a robot's, which nobody judges, has one
+    SESSIONS.append(len(SESSIONS) + 1)
+    report = {"session": SESSIONS[-1]}
+    env.backend.report = lambda: report  # as a robot's, which nobody judges, has one
     return deploy.Deployment(cfg, agent, env, judge, operator).loop()
 
 
@@ -124,6 +129,7 @@ def test_a_mark_after_an_undo_changes_the_rollout_before_alone(tmp_path):
 def test_what_is_left_of_a_session_goes_on_with_more_rollouts(tmp_path):
     """As on a robot: the real rollouts are the measure. A mark of the last one keeps what was measured of it."""
     folder = tmp_path / "r"
+    SESSIONS.clear()
     run(folder, None, "rollouts=2", "eval_every=1", judged=False)
     before = rows(folder, "metrics.csv")
     with pytest.raises(UserError, match="rollouts=1: .* has 2 already. Give as many or more"):
@@ -131,6 +137,8 @@ def test_what_is_left_of_a_session_goes_on_with_more_rollouts(tmp_path):
     go_on(folder, Script({("resetting", 2): ["success"]}), "rollouts=3")
     after = rows(folder, "metrics.csv")
     assert after[:2] == before and len(after) == 3, "what an earlier process measured stays"
+    summary = json.loads((folder / "summary.json").read_text())
+    assert summary["robot"] == {"session": 3} and summary["robot_before"] == [{"session": 1}]  # 2 was refused
     assert learned(folder) == [(1, False), (2, True), (3, False)]
     path = folder / "checkpoint" / "state.pt"
     state = checkpoint.load_state(path)
