@@ -1,4 +1,4 @@
-# make help lists the targets. Needs Python 3.11 or newer and git; everything else is installed into .venv.
+# make help lists the targets. Needs Linux, Python 3.11 or newer and git; everything else is installed into .venv.
 SHELL := /bin/bash
 .SHELLFLAGS := -eu -o pipefail -c
 .DEFAULT_GOAL := help

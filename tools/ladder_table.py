@@ -33,7 +33,7 @@ def rung(row: Row) -> str:
         rate += " and plans that end in Q" if "method.terminal" in words else ""
         return f"`tdmpc2`{rate} with {', '.join(named)}" if named else f"`tdmpc2`{rate}, plain"
     if not named:
-        return "`sgft`, all of ours"
+        return "`sgft`, all of ours then"
     if len(named) <= 2:
         return f"all but {', '.join(named)}"
     kept = [what for what in ADDITIONS.values() if what not in named and what != "few causes"]

@@ -27,9 +27,12 @@ def pretrain() -> str:
     parts += ["A wide model:", pick(read("pretrain/precision.csv"), rounded | {"return": "return"})]
     own = {k: v for k, v in head.items() if k != "minutes"} | {"learner's memory [MB]": "learner_mb"}
     parts += ["Collected on a Ray cluster:", pick(read("pretrain/ray.csv"), own)]
-    spent = {f"{part} [s]": f"{part}_seconds" for part in ("update", "evaluate", "wait", "save")}
+    spent = {name: head[name] for name in (*ROUNDED, "prior")}
+    spent |= {f"{part} [s]": f"{part}_seconds" for part in ("update", "evaluate", "wait", "save")}
     spent |= {"learner [MB]": "learner_mb", "collector [MB]": "collector_mb"}
-    return "\n\n".join([*parts, "Where its seconds go, and its memory:", pick(read("pretrain/parts.csv"), spent)])
+    return "\n\n".join(
+        [*parts, "Seed 0 by later code, where its seconds go, and its memory:", pick(read("pretrain/parts.csv"), spent)]
+    )
 
 
 def transfer() -> str:

@@ -1,4 +1,4 @@
-"""The gaps that are measured once can be closed: who knows them nearly always succeeds, and who does not less often."""
+"""The gaps that are kept aside can be closed: who knows them nearly always succeeds, and who does not less often."""
 
 import numpy as np
 import pytest

@@ -50,7 +50,7 @@ def test_rungs_are_named_by_what_they_have() -> None:
         return ladder_table.rung({"method": method, "variant": variant})
 
     off = [f"{setting}=0" for setting in ladder_table.ADDITIONS if "sparsity" not in setting]
-    assert named("sgft", "") == "`sgft`, all of ours"
+    assert named("sgft", "") == "`sgft`, all of ours then"
     assert named("sgft", " ".join(off)) == "the objective alone"
     assert named("sgft", " ".join(w for w in off if "gate" not in w)) == "gate alone"
     assert named("sgft", "method.anchor=0") == "all but anchor"

@@ -30,6 +30,7 @@ from tools.tables import read as rows_of
 
 COLUMNS = ["figure", "paper", "here", "verdict"]
 CONFIRMED, NOT, OPEN = "confirmed", "not confirmed", "not tested"
+IN_THE_MEAN = "confirmed in the mean"  # over gaps, not in each
 PUSH = ("turned", "sluggish", "skate")
 TASKS = {
     "hammer_real": "hammer",
@@ -156,7 +157,7 @@ def falls_first(curves: Curves) -> tuple[str, str]:
 
 
 def faster(_: Curves) -> tuple[str, str]:
-    """Whether a run of SGFT probably ends above one of each of the paper's baselines."""
+    """Whether a run of SGFT probably ends above one of each of the paper's baselines, pooled over the gaps."""
     if not existing("benchmark/better.csv"):
         return "", OPEN
     rows = [r for r in rows_of("benchmark/better.csv") if r["method"] == "sgft" and r["over"] in BASELINES]
@@ -164,9 +165,11 @@ def faster(_: Curves) -> tuple[str, str]:
     by = {r["over"]: r for r in rows if int(r["rollouts"]) == first}
     found = [f"{m} {percent(r['probability'])} [{percent(r['low'])}, {percent(r['high'])}]" for m, r in by.items()]
     gaps = " and ".join(dict.fromkeys(r["gaps"] for r in by.values()))
-    said = f"a run of SGFT ends above one of the others after {first} rollouts ({gaps}) with a probability of: "
+    said = f"pooled over the gaps ({gaps}), a run of SGFT ends above one of the others after {first} rollouts with a "
+    said += "probability of: "
     said += ", ".join(found)
-    return said, verdict(len(by) == len(BASELINES), all(float(r["low"]) > 0.5 for r in by.values()))
+    judged = verdict(len(by) == len(BASELINES), all(float(r["low"]) > 0.5 for r in by.values()))
+    return said, IN_THE_MEAN if judged == CONFIRMED else judged
 
 
 def horizon_matters(_: Curves) -> tuple[str, str]:
