@@ -82,6 +82,7 @@ class Plant:
         model: Compiled from it.
         joints: Names in the model's order.
         actuators: Names in the model's order.
+        histories: Lengths of command histories that the scene has and no delay needs, by actuator.
     """
 
     spec: mujoco.MjSpec
@@ -91,10 +92,15 @@ class Plant:
     model: mujoco.MjModel = field(init=False)
     joints: list[str] = field(init=False)
     actuators: list[str] = field(init=False)
+    histories: dict[str, int] = field(init=False)
 
     def __post_init__(self) -> None:
         self.spec = self.spec.copy()
         _name_all(self.spec)
+        idle = [actuator for actuator in self.spec.actuators if actuator.nsample and not actuator.delay]
+        self.histories = {actuator.name: actuator.nsample for actuator in idle}
+        for actuator in idle:  # every state of every simulated step would hold it
+            actuator.nsample = 0
         there = {sensor.name for sensor in self.spec.sensors}
         for actuator in self.spec.actuators:  # so that a measured force can be compared
             if f"{FORCE}{actuator.name}" in there:

@@ -30,6 +30,8 @@ def nominal_spec(plant: Plant) -> mujoco.MjSpec:
     for sensor in list(spec.sensors):
         if sensor.name.startswith(FORCE):
             spec.delete(sensor)
+    for actuator in spec.actuators:
+        actuator.nsample = plant.histories.get(actuator.name, actuator.nsample)
     return spec
 
 

@@ -8,6 +8,7 @@ import mujoco
 import pytest
 
 from mpc_sgft.diagnose.simulation.plant import load_plant
+from mpc_sgft.diagnose.verdict.repair import nominal_spec
 
 PYRAMID = "v 0 0 0\nv .1 0 0\nv 0 .1 0\nv 0 0 .1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
 ROBOT = """<mujoco model="robot"><compiler meshdir="assets"/><asset><mesh name="t" file="t.obj"/></asset>
@@ -31,3 +32,16 @@ def test_a_scene_written_elsewhere_finds_its_meshes(kind: str, tmp_path: Path) -
     written = tmp_path / "out" / "repaired.xml"
     written.write_text(load_plant(given).spec.to_xml())
     assert mujoco.MjModel.from_xml_path(str(written)).nmesh == 1
+
+
+def test_a_command_history_that_no_delay_needs_is_in_no_state_and_in_the_repaired_scene(tmp_path: Path) -> None:
+    scene = tmp_path / "scene.xml"
+    scene.write_text(
+        '<mujoco><worldbody><body><joint name="x" type="slide"/><geom size=".1"/></body></worldbody><actuator>'
+        '<motor name="a" joint="x" nsample="200"/><motor name="b" joint="x" nsample="30" delay=".01"/></actuator>'
+        "</mujoco>"
+    )
+    plant = load_plant(scene)
+    assert plant.model.actuator_history[:, 0].tolist() == [0, 30]
+    kept = nominal_spec(plant)
+    assert kept.compile().actuator_history[:, 0].tolist() == [200, 30]
