@@ -5,8 +5,10 @@ is therefore one round old. With as many workers, all give the same numbers.
 """
 
 import multiprocessing
+import os
 import pickle
 import signal
+import threading
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
@@ -124,8 +126,17 @@ def _begin(blob: bytes) -> None:
     """Start of a collecting process. Ctrl-C is the learner's affair, which stops at the end of its round."""
     global _explorer
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_the_learner, daemon=True).start()
     torch.set_num_threads(1)
     _explorer = Explorer(*pickle.loads(blob), threads=1)
+
+
+def _end_with_the_learner() -> None:
+    """Leave when the learner is gone, killed before it could say so."""
+    learner = multiprocessing.parent_process()
+    assert learner is not None  # there is one in a collecting process
+    learner.join()
+    os._exit(1)
 
 
 def _collect(blob: bytes) -> bytes:

@@ -2,9 +2,13 @@
 
 import os
 import signal
+import subprocess
+import sys
 import time
+from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 import torch
 from omegaconf import OmegaConf
@@ -18,6 +22,7 @@ from mpc_sgft.runs.explore import Collected, Round, explorer, policy_weights, sh
 from mpc_sgft.runs.pretrain import start_agent
 from mpc_sgft.storage import checkpoint
 
+ROOT = Path(__file__).resolve().parents[3]
 SIZES = dict(obs_dim=6, action_dim=2, decode_dim=3, latent_dim=16, mlp_dim=32, enc_dim=32, num_q=2)
 
 
@@ -196,3 +201,23 @@ def test_the_final_evaluation_takes_the_cores_that_it_is_allowed(monkeypatch, gi
     if given is not None:
         monkeypatch.setenv("OMP_NUM_THREADS", given)
     assert pretrain.free_threads() == threads
+
+
+@pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGKILL])
+def test_a_learner_that_is_killed_leaves_no_process_behind(tmp_path: Path, how: signal.Signals) -> None:
+    line = [sys.executable, "-m", "mpc_sgft.pretrain", "--quiet", "+experiment=debug", "task=pendulum"]
+    line += ["transitions=1000000", "log.tensorboard=false", f"run_dir={tmp_path / 'r'}"]
+    learner = subprocess.Popen(line, stderr=subprocess.DEVNULL, env={**os.environ, "PYTHONPATH": str(ROOT)})
+    try:
+        deadline = time.monotonic() + 120
+        while not (tmp_path / "r" / "metrics.csv").is_file():
+            assert learner.poll() is None and time.monotonic() < deadline
+            time.sleep(0.1)
+        family = psutil.Process(learner.pid).children(recursive=True)
+        assert family
+        learner.send_signal(how)
+        learner.wait()
+    finally:
+        learner.kill()
+    _, alive = psutil.wait_procs(family, timeout=20)
+    assert not alive
