@@ -164,7 +164,13 @@ def healthy() -> str:
 
 def critic() -> str:
     head = {"critic": "critic", "puck at x [m]": "puck_x_m", "V": "value", "return": "return"}
-    return pick(read("critic_profile/critic_profile.csv"), head)
+    puck = pick(read("critic_profile/critic_profile.csv"), head)
+    rows = read("critic_profile/rope.csv")
+    aside = list(dict.fromkeys(row["hand_aside_m"] for row in rows))
+    heights = dict.fromkeys(row["hand_above_m"] for row in rows)
+    lines = [[above, *(row["value"] for row in rows if row["hand_above_m"] == above)] for above in heights]
+    peg = table(["V, hand over the table [m]", *(f"{x} m across" for x in aside)], lines)
+    return f"{puck}\n\nA peg beside the hole, the hand over it or across the hole:\n\n{peg}"
 
 
 def exact() -> str:
