@@ -67,6 +67,8 @@ def of_horizons() -> Curves:
     """Each horizon's curve; H = 4, which all other runs have, is that of the transfer, as far as the others go."""
     found, usual = values(existing("horizon/horizon.csv")), values(existing("transfer/sgft.csv"))
     for gap, curves in found.items():
+        if "sgft" in curves:
+            curves["sgft horizon=4"] = curves.pop("sgft")
         last = max(max(curve) for curve in curves.values())
         if "sgft" in usual[gap]:
             curves["sgft horizon=4"] = {n: x for n, x in usual[gap]["sgft"].items() if n <= last}
