@@ -154,17 +154,20 @@ class EpisodeWriter:
 
     def key(self, word: str, *, time: float, unix: float) -> None:
         """Append a key that a person pressed: when since the episode's start, and by the computer's clock, [s]."""
-        self._write({"/keys": _dumps({"key": word, "time": time, "unix": unix})})
+        pressed = max(self._time, round(time * 1e9))
+        self._write({"/keys": _dumps({"key": word, "time": time, "unix": unix})}, time=pressed)
 
     def guided(self, samples: Mapping[str, Any]) -> None:
-        """Append what was measured while a person moved the arm, each [S, …]."""
+        """Append what was measured while a person moved the arm, each [S, …], `time` [s] among it."""
         arrays = {key: np.asarray(value) for key, value in samples.items()}
+        self._time = max(self._time, round(float(arrays["time"].max(initial=0.0)) * 1e9))
         self._write({"/guided": _dumps({key: array.tolist() for key, array in arrays.items()}, arrays)})
 
     def copy(self, topic: str, time: int, data: bytes) -> None:
         """Append a message of another episode as it is."""
         self._time = time  # [ns]
-        self._write({topic: data.decode()})
+        self._write({topic: data.decode()}, step=self.steps - (topic == "/joints"))  # which follow their transition
+        self.steps += topic == "/transition"
 
     def close(self, outcome: Mapping[str, Any]) -> None:
         """Write the outcome (success, return, reason it ended, …) and the file's index, then close it."""
@@ -194,13 +197,15 @@ class EpisodeWriter:
         schema_id = self._writer.register_schema(f"mpc_sgft.{topic.strip('/')}", SchemaEncoding.JSONSchema, data)
         return self._writer.register_channel(topic, MessageEncoding.JSON, schema_id)
 
-    def _write(self, messages: Mapping[str, str]) -> None:
+    def _write(self, messages: Mapping[str, str], *, time: int | None = None, step: int | None = None) -> None:
+        """Append messages of one time [ns] and flush them; None: of the time that was reached, and the next step."""
+        time, step = self._time if time is None else time, self.steps if step is None else step
         if self._file is None:
             raise ValueError(f"The episode {self.path} is closed: nothing can be added to it.")
         try:
             for topic, text in messages.items():
                 channel = self._channels[topic]
-                self._writer.add_message(channel, self._time, text.encode(), self._time, sequence=self.steps)
+                self._writer.add_message(channel, time, text.encode(), time, sequence=step)
             self._writer.flush()
         except OSError as error:
             raise self._failed(error) from error

@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
+from mpc_sgft.session.corrections import amend
 from mpc_sgft.storage.episode_file import EpisodeWriter, read_episode
+from mpc_sgft.storage.rollout import Press
 
 METADATA = {"task": "push", "joint_names": ["a", "b"], "seed": 3, "control_dt": 0.2}
 
@@ -78,6 +80,34 @@ def test_ordinary_mcap_readers_understand_the_file(tmp_path):
         found = [(c.topic, m.log_time, json.loads(m.data)) for _, c, m in make_reader(file).iter_messages()]
     steps = [(log_time, data["step"]) for topic, log_time, data in found if topic == "/transition"]
     assert steps == [(k * 200_000_000, k) for k in range(10)]
+
+
+def test_keys_and_a_takeover_are_stamped_when_they_were(tmp_path):
+    """And an episode that is amended keeps its stamps and counts."""
+
+    def stamps() -> list[tuple[str, float, int]]:
+        with (tmp_path / "0.mcap").open("rb") as file:
+            found = [(c.topic, m.log_time / 1e9, m.sequence) for _, c, m in make_reader(file).iter_messages()]
+        return found[1:]  # metadata
+
+    with EpisodeWriter(tmp_path / "0.mcap", METADATA | {"began_unix": 1000.0}) as writer:
+        for k in range(2):
+            writer.step(transition(k), samples(k))
+        writer.key("takeover", time=0.35, unix=1000.35)
+        for begin in (5.0, 15.0):
+            writer.guided({"time": begin + np.array([0, 0.1])})
+        writer.key("confirm", time=15.05, unix=1015.05)  # while the samples came
+        writer.key("takeover", time=31.0, unix=1031.0)
+        writer.close({})
+    steps = [(topic, 0.2 * k, k) for k in range(2) for topic in ("/transition", "/joints")]
+    person = [("/keys", 0.35, 2), ("/guided", 5.1, 2), ("/guided", 15.1, 2), ("/keys", 15.1, 2)]
+    before = stamps()
+    assert before == [*steps, *person, ("/outcome", 15.1, 2), ("/keys", 31.0, 2)]
+    amend(tmp_path / "0.mcap", [Press("success", 1040.0, 1)], True)
+    assert [stamp for stamp in stamps() if stamp[0] != "/outcome"] == [
+        *(stamp for stamp in before if stamp[0] != "/outcome"),
+        ("/keys", 40.0, 2),
+    ]
 
 
 def test_what_is_not_finite_comes_back_as_nan(tmp_path):
