@@ -21,6 +21,7 @@ from mpc_sgft.command.errors import UserError, disk_error
 from mpc_sgft.storage.whole_file import write_whole
 
 PACKAGES = "torch torchrl tensordict mujoco gymnasium numpy scipy hydra-core safetensors mcap rerun-sdk".split()
+SUMMARY = "summary.json"  # inside a run folder
 
 
 def start(cfg: DictConfig, root: Path | str = "runs") -> Path:
@@ -60,9 +61,10 @@ def start(cfg: DictConfig, root: Path | str = "runs") -> Path:
 
 
 def keep_told(cfg: DictConfig, folder: Path) -> None:
-    """Write what a resumed run is told now into its config.yaml, so that it holds the next time.
+    """Write what a resumed run is told now into its config.yaml, so that it holds the next time, and go on with it.
 
-    Call it when all is built and loaded: what is refused until then changes nothing. A new run's file stays.
+    A summary that is there is taken away: it is of a run that was finished. Call it when all is built and loaded: what
+    is refused until then changes nothing. A new run's file stays.
 
     Raises:
         UserError: If it cannot be written.
@@ -72,6 +74,7 @@ def keep_told(cfg: DictConfig, folder: Path) -> None:
     told = OmegaConf.to_yaml(OmegaConf.merge(cfg, {"resume": None}), resolve=True)
     try:
         write_whole(folder / "config.yaml", told.encode())
+        (folder / SUMMARY).unlink(missing_ok=True)
     except OSError as err:
         raise UserError(disk_error(err) or f"{err.filename}: {err.strerror}.") from err
 
@@ -109,7 +112,7 @@ def _link(link: Path, folder: Path) -> None:
 
 def write_summary(folder: Path, summary: dict[str, Any]) -> None:
     """summary.json, whole or not at all: who finds it takes the run as finished."""
-    write_whole(folder / "summary.json", (json.dumps(summary, indent=2) + "\n").encode())
+    write_whole(folder / SUMMARY, (json.dumps(summary, indent=2) + "\n").encode())
 
 
 def versions() -> dict[str, Any]:

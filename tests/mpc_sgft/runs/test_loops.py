@@ -396,7 +396,8 @@ def test_what_a_resumed_run_refuses_leaves_it_as_it_was(pretrained, deployed, tm
         folder = shutil.copytree(run, tmp_path / wrong)
         done = here(name, "--resume", str(folder), wrong)
         assert done.returncode == 2 and wrong.rpartition(".")[2] in done.stderr, done.stderr
-        assert (folder / "config.yaml").read_bytes() == (run / "config.yaml").read_bytes()
+        for kept in ("config.yaml", "summary.json"):
+            assert (folder / kept).read_bytes() == (run / kept).read_bytes()
 
 
 def test_a_checkpoint_that_changed_since_is_said_before_anything_is_driven(pretrained, deployed, tmp_path):

@@ -137,6 +137,28 @@ def test_what_is_left_of_a_session_goes_on_with_more_rollouts(tmp_path):
         go_on(folder, None)
 
 
+def test_a_finished_run_that_goes_on_has_no_summary_until_it_is_finished_again(tmp_path, monkeypatch):
+    folder, drive = tmp_path / "r", deploy.drive
+
+    def stopped(*args, number: int, **more):
+        if number == 3:
+            raise KeyboardInterrupt
+        return drive(*args, number=number, **more)
+
+    run(folder, None, "rollouts=1", judged=False)
+    before = (folder / "summary.json").read_bytes()
+    with pytest.raises(UserError, match="Give as many or more"):
+        go_on(folder, None, "rollouts=0")
+    assert (folder / "summary.json").read_bytes() == before
+    monkeypatch.setattr(deploy, "drive", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        go_on(folder, None, "rollouts=4")
+    assert not (folder / "summary.json").exists()
+    monkeypatch.setattr(deploy, "drive", drive)
+    for _ in range(2):  # the second time there is nothing left to do
+        assert go_on(folder, None) == json.loads((folder / "summary.json").read_text())
+
+
 def test_what_a_rollout_that_breaks_down_leaves_behind(tmp_path, monkeypatch):
     """The mark of the one before is kept; one that was measured and not learned from is not audited twice."""
     drive, learn = deploy.drive, Transfer.learn
