@@ -80,6 +80,7 @@ def test_groups_and_effects_are_the_files_on_disk() -> None:
         (["planner.temperature=hot"], ["a number is needed"]),
         (["eval_every=0"], ["eval_every=0: a whole number from 1 on"]),
         (["train.replay.batch_size=0"], ["train.replay.batch_size=0: a whole number from 1 on"]),
+        (["method.slice_len=0"], ["method.slice_len=0: a whole number from 1 on"]),
         (["warmup=-1"], ["warmup=-1: a whole number from 0 on"]),
         (["seed=-1"], ["a whole number"]),
         (["eval_seed=-1"], ["eval_seed=-1: a whole number"]),

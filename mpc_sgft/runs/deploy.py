@@ -86,10 +86,15 @@ def make_transfer(
     """A pretrained agent in the hands of `cfg.method`; simulated episodes are those of pretraining, if not given.
 
     Raises:
-        UserError: For a number that the method refuses.
+        UserError: For a number that the method refuses, or where it learns and no episode holds one of its slices.
     """
     with from_config("method"):
         method = instantiate(cfg.method, _convert_="all")
+    if method.updates and not 1 <= method.slice_len <= episode_steps:
+        raise UserError(
+            f"method.slice_len={method.slice_len}: an episode of {episode_steps} steps holds no such slice. "
+            f"Give 1 to {episode_steps}."
+        )
     return Transfer(
         agent,
         method,

@@ -375,6 +375,7 @@ def test_the_scripted_pendulum_swings_up(tmp_path):
         (["gap.effects.actuator_gain.gain=99"], "-5"),
         (["gap.effects.actuator_gain.gian=0.5"], "gain"),
         (["method.win_stay=null"], "win_stay=None must be 0 or more"),
+        (["method.slice_len=41"], "method.slice_len=41: an episode of 40 steps holds no such slice"),
         (["planner.num_elites=100000"], "num_elites"),
         (["model=5M"], "latent_dim"),
         (["train=recurrent_dr"], "train=recurrent_dr begins a policy anew"),
