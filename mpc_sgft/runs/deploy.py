@@ -35,6 +35,7 @@ from mpc_sgft.storage import checkpoint, run_folder
 from mpc_sgft.storage.episode_file import read_episode
 from mpc_sgft.storage.metrics import GrowingTable, MetricLogger, progress
 from mpc_sgft.storage.rollout import Rollout, from_episode
+from mpc_sgft.storage.whole_file import naming
 from mpc_sgft.views.deploy_view import DeployViewer
 
 
@@ -295,8 +296,10 @@ class Deployment:
         model, horizon = self._driver(number), self.cfg.planner.horizon
         error = open_loop_error(model, rollout.steps, horizon)
         found = audit(model, rollout.steps, self.cfg.task.discount, seed=number)
-        forget_audit(self.folder / "audit.csv", number)  # a process that was killed while it learned had written it
-        write_audit(self.folder / "audit.csv", number, rollout.steps, found.margin, self.env.task.observation_names)
+        path, names = self.folder / "audit.csv", self.env.task.observation_names
+        forget_audit(path, number)  # a process that was killed while it learned had written it
+        with naming(path):
+            write_audit(path, number, rollout.steps, found.margin, names)
         metrics = {
             "real_success": float(rollout.success),
             "real_return": float(rollout.steps["next", "reward"].sum()),

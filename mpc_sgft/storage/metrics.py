@@ -1,8 +1,8 @@
 """Numbers of a run on their way to metrics.csv, TensorBoard, wandb and the terminal."""
 
 import csv as csv_file
+import io
 import math
-import os
 import sys
 import time
 from collections.abc import Mapping
@@ -11,6 +11,8 @@ from typing import Any, NamedTuple, Self, TextIO
 
 import numpy as np
 from tqdm import tqdm
+
+from mpc_sgft.storage.whole_file import naming, write_whole
 
 
 class MetricLogger:
@@ -45,12 +47,13 @@ class MetricLogger:
         run_dir = Path(run_dir)
         self._csv = _CsvTable(run_dir / "metrics.csv", resume_step) if csv else None
         self._wandb = _wandb_run(run_dir, resume_step) if wandb else None
-        self._board = None
+        self._board, self._board_dir = None, run_dir / "tensorboard"
         if tensorboard:
             from torch.utils.tensorboard import SummaryWriter  # imports torch: late, so that --help stays quick
 
             purge = None if resume_step is None else resume_step + 1
-            self._board = SummaryWriter(str(run_dir / "tensorboard"), purge_step=purge)
+            with naming(self._board_dir):
+                self._board = SummaryWriter(str(self._board_dir), purge_step=purge)
 
     def log(self, step: int, values: Mapping[str, Any]) -> None:
         """Append one row.
@@ -66,9 +69,10 @@ class MetricLogger:
         if self._csv is not None:
             self._csv.append(step, row)
         if self._board is not None:
-            for name, value in row.items():
-                self._board.add_scalar(name, value, step)
-            self._board.flush()
+            with naming(self._board_dir):
+                for name, value in row.items():
+                    self._board.add_scalar(name, value, step)
+                self._board.flush()
         if self._wandb is not None:
             self._wandb.log(row, step=step)
 
@@ -122,21 +126,18 @@ class _CsvTable:
         return [dict(zip(self._columns, row, strict=True)) for row in rows[1:]]
 
     def _replace(self, rows: list[dict[str, str]]) -> None:
-        """Write the whole table beside the old one, then swap, so that no moment exists without a whole file."""
-        beside = self._path.with_suffix(".csv.new")
-        with beside.open("w", newline="") as file:
-            writer = csv_file.writer(file, lineterminator="\n")
-            writer.writerow(self._columns)
-            writer.writerows([row.get(name, "") for name in self._columns] for row in rows)
-        os.replace(beside, self._path)
+        """Write the whole table in place of the old one."""
+        text = io.StringIO(newline="")
+        writer = csv_file.writer(text, lineterminator="\n")
+        writer.writerow(self._columns)
+        writer.writerows([row.get(name, "") for name in self._columns] for row in rows)
+        write_whole(self._path, text.getvalue().encode())
         self._file = self._path.open("a", newline="")
 
     def _write(self, rows: list[list[str]]) -> None:
-        try:
+        with naming(self._path):
             csv_file.writer(self._file, lineterminator="\n").writerows(rows)
             self._file.flush()
-        except OSError as error:
-            raise OSError(error.errno, error.strerror, str(self._path)) from error
 
 
 def _scalar(name: str, value: Any) -> float:

@@ -32,7 +32,7 @@ import numpy as np
 import rerun as rr
 from rerun.chunk import Chunk, RrdReader
 
-from mpc_sgft.storage.whole_file import write_whole
+from mpc_sgft.storage.whole_file import naming, write_whole
 from mpc_sgft.views.blueprint import Layout, blueprint
 from mpc_sgft.views.episode_view import Candidates, EpisodeView, Rows, log_episode, log_series_styles
 from mpc_sgft.views.robot_view import RobotView
@@ -214,11 +214,9 @@ class RunViewer:
         self._recording.reset_time()
         new = self._stream.read() or b""  # a whole file: header, messages, footer
         data = new[0 if self._file.tell() == 0 else RRD_HEADER : _end_of_messages(new)]
-        try:
+        with naming(self.path):
             while data:
                 data = data[self._file.write(data) :]
-        except OSError as error:
-            raise OSError(error.errno, error.strerror, str(self.path)) from error
 
 
 def _end_of_messages(data: bytes) -> int:
@@ -264,5 +262,6 @@ def _chunks(path: Path) -> list[Chunk]:
     with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*no footer.*")  # only `close` writes one
         readable = Path(folder) / path.name
-        readable.write_bytes(data[:whole])
+        with naming(readable):
+            readable.write_bytes(data[:whole])
         return RrdReader(readable).stream().to_chunks()

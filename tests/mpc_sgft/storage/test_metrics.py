@@ -3,6 +3,8 @@ import io
 import math
 import resource
 import sys
+import threading
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
@@ -67,17 +69,39 @@ def test_values_that_are_no_scalars_are_named(tmp_path):
             logger.log(0, {"step": 1})
 
 
-def test_a_full_disk_names_the_file(tmp_path):
+@contextmanager
+def full_at(size: int):
+    """No file may grow beyond so many bytes, which is what a full disk is to a writer."""
     limit = resource.getrlimit(resource.RLIMIT_FSIZE)
-    logger = MetricLogger(tmp_path, tensorboard=False)
-    logger.log(0, {"loss": 0})
-    resource.setrlimit(resource.RLIMIT_FSIZE, (100, limit[1]))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, limit[1]))
     try:
-        with pytest.raises(OSError, match="metrics.csv"):
-            for step in range(100):
-                logger.log(step, {"loss": 0})
+        yield
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limit)
+
+
+@pytest.mark.parametrize("name", ["loss", "another"])
+def test_a_full_disk_names_the_file(tmp_path, name):
+    logger = MetricLogger(tmp_path, tensorboard=False)
+    logger.log(0, {"loss": 0})
+    with full_at(100), pytest.raises(OSError, match="metrics.csv'"):
+        for step in range(100):
+            logger.log(step, {name if step > 10 else "loss": 0})
+    assert [row["step"] for row in rows(tmp_path)][:11] == ["0", *map(str, range(10))]
+    with full_at(5), pytest.raises(OSError, match="metrics.csv'"):
+        MetricLogger(tmp_path, tensorboard=False, resume_step=9)
+    assert list(tmp_path.iterdir()) == [tmp_path / "metrics.csv"]
+
+
+def test_a_full_disk_names_the_files_of_tensorboard(tmp_path, monkeypatch):
+    monkeypatch.setattr(threading, "excepthook", lambda _: None)  # TensorBoard's own thread ends with it, too
+    others = threading.enumerate()
+    logger = MetricLogger(tmp_path, csv=False)
+    (events,), (worker,) = (tmp_path / "tensorboard").iterdir(), set(threading.enumerate()).difference(others)
+    with full_at(events.stat().st_size + 20), pytest.raises(OSError, match="tensorboard'"):
+        for step in range(100):
+            logger.log(step, {"loss": 0})
+    worker.join(10)
 
 
 def test_tensorboard_has_the_same_numbers(tmp_path):

@@ -260,6 +260,9 @@ def test_a_full_disk_is_an_error_with_the_path(tmp_path):
         with pytest.raises(OSError, match="run.rrd"):
             for k in range(20):
                 viewer.episode(episode(seed=k))
+        resource.setrlimit(resource.RLIMIT_FSIZE, (5000, limit[1]))
+        with pytest.raises(OSError, match="run.rrd'"):  # the place of temporary files is as full
+            RunViewer(tmp_path / "run.rrd", None, control_dt=0.2, resume=True)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limit)
 
