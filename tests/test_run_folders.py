@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 from pathlib import Path
 
@@ -59,6 +60,17 @@ def test_resume_takes_the_saved_config_and_its_folder(loops: Path, capsys) -> No
     assert cli.run(probe("show"), ["--resume", "whole", "planner.temperature=0.5"]) == 0
     assert cli.run(probe("show"), ["--resume", "whole", "rollouts=${nowhere}"]) == 2
     assert "cannot be resolved" in capsys.readouterr().err
+
+
+def test_what_a_resumed_run_is_told_does_not_fit_on_the_disk(loops: Path, monkeypatch, capsys) -> None:
+    def full(path: Path, data: bytes) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device", str(path))
+
+    assert cli.run(probe("folder"), ["run_dir=first"]) == 0
+    monkeypatch.setattr(run_folder, "write_whole", full)
+    assert cli.run(probe("folder"), ["--resume", "first", "horizon=3"]) == 2
+    said = capsys.readouterr().err
+    assert "first/config.yaml: the disk is full" in said and "the same --resume goes on" in said
 
 
 def test_a_resumed_run_changes_what_is_given_as_another_setting_too(loops: Path) -> None:

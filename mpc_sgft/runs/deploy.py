@@ -15,7 +15,7 @@ from tensordict import TensorDict
 
 from envs.backends.base import BackendError
 from envs.env import ControlEnv
-from mpc_sgft.command.errors import Stopped, UserError, disk_error, from_config
+from mpc_sgft.command.errors import Stopped, UserError, disk_errors, from_config
 from mpc_sgft.learning.agent import Agent
 from mpc_sgft.learning.audit import audit, write_audit
 from mpc_sgft.learning.observation_map import Sensed
@@ -52,7 +52,8 @@ def deploy(cfg: DictConfig) -> int:
             return robot.dry_run(cfg, agent.model, env)
         run = Deployment(cfg, agent, env, None if real else build.make_env(cfg, cfg.eval_episodes), operator)
         try:
-            summary = run.loop()
+            with disk_errors(lambda: f"Make room. Every whole step is on disk, {run.how_to_go_on()}"):
+                summary = run.loop()
         except Stopped:
             raise
         except KeyboardInterrupt as error:  # a second Ctrl-C
@@ -61,16 +62,10 @@ def deploy(cfg: DictConfig) -> int:
             with suppress(OSError):
                 print(f"\n{run.how_to_go_on()}", file=sys.stderr)
             raise
-        except BackendError as error:
+        except BackendError as error:  # closing the backend, on the way out, brings the arm to rest
             if operator.stopping or run.stop.asked:
                 raise Stopped(run.how_to_go_on()) from error
             raise UserError(f"{error} {run.how_to_go_on()}") from error
-        except OSError as error:  # closing the backend, on the way out, brings the arm to rest
-            then = f"Make room. Every whole step is on disk, {run.how_to_go_on()}"
-            message = disk_error(error, then)
-            if message is None:
-                raise
-            raise UserError(message) from error
         finally:
             run.stop.restore()
     print(json.dumps(summary))
@@ -138,8 +133,6 @@ class Deployment:
         self.logger = self.make_logger(self.state["rollouts"] if cfg.resume is not None else None)
         self.metrics: dict[str, float] = {}  # of the last rollout
         self.verdicts = Verdicts(self, ask=person.asks(cfg))
-        self.stop = StopRequest("rollout")
-        self.operator.heed(lambda: self.stop.asked)
         self.viewer = (
             DeployViewer(self.folder / "run.rrd", env, megabytes=cfg.log.rerun_mb, resume=bool(cfg.resume))
             if cfg.log.rerun
@@ -147,6 +140,8 @@ class Deployment:
         )
         self.began = time.monotonic() - self.state["seconds"]
         run_folder.keep_told(cfg, self.folder)
+        self.stop = StopRequest("rollout")  # last: what is refused until then leaves Ctrl-C as it was
+        self.operator.heed(lambda: self.stop.asked)
 
     def loop(self) -> dict[str, Any]:
         """Run what is left, and write the summary."""

@@ -17,7 +17,7 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from mpc_sgft import __version__
-from mpc_sgft.command.errors import UserError, disk_error
+from mpc_sgft.command.errors import AGAIN, UserError, disk_error
 from mpc_sgft.storage.whole_file import write_whole
 
 PACKAGES = "torch torchrl tensordict mujoco gymnasium numpy scipy hydra-core safetensors mcap rerun-sdk".split()
@@ -76,7 +76,7 @@ def keep_told(cfg: DictConfig, folder: Path) -> None:
         write_whole(folder / "config.yaml", told.encode())
         (folder / SUMMARY).unlink(missing_ok=True)
     except OSError as err:
-        raise UserError(disk_error(err) or f"{err.filename}: {err.strerror}.") from err
+        raise UserError(disk_error(err, AGAIN) or f"{err.filename}: {err.strerror}. {AGAIN}") from err
 
 
 def _new_folder(run_dir: str | None, parent: Path) -> Path:

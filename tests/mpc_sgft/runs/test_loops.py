@@ -3,6 +3,7 @@
 import contextlib
 import copy
 import csv
+import errno
 import io
 import json
 import os
@@ -112,6 +113,18 @@ def test_a_run_that_stopped_before_it_saved_begins_again(pretrained, tmp_path):
     weights, again = (load_file(f / "checkpoint" / "model.safetensors") for f in (pretrained, tmp_path / "r"))
     assert all((weights[k] == again[k]).all() for k in weights)
     assert [r["updates"] for r in rows(tmp_path / "r")] == [r["updates"] for r in rows(pretrained)]
+
+
+def test_a_disk_that_fills_up_ends_pretraining_with_how_to_go_on(tmp_path, monkeypatch):
+    def full(path, state):
+        raise OSError(errno.ENOSPC, "No space left on device", str(path))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(checkpoint, "save_state", full)
+        done = here("pretrain", f"run_dir={tmp_path / 'r'}", "transitions=320", "collector=inline")
+    assert done.returncode == 2 and "checkpoint/state.pt: the disk is full" in done.stderr, done.stderr
+    assert f"--resume {tmp_path / 'r'}" in done.stderr and "run_dir=" not in done.stderr
+    assert here("pretrain", "--resume", str(tmp_path / "r")).returncode == 0
 
 
 def test_a_final_evaluation_that_was_left_plans_with_the_range_of_what_was_learned(tmp_path, monkeypatch):
