@@ -32,7 +32,7 @@ from mpc_sgft.session.keyboard import ending_in_order
 from mpc_sgft.session.operator import Nobody, Operator
 from mpc_sgft.session.verdicts import Verdicts
 from mpc_sgft.storage import checkpoint, run_folder
-from mpc_sgft.storage.episode_file import read_episode
+from mpc_sgft.storage.episode_file import Episode, read_episode
 from mpc_sgft.storage.metrics import GrowingTable, MetricLogger, progress
 from mpc_sgft.storage.rollout import Rollout, from_episode
 from mpc_sgft.storage.whole_file import naming
@@ -226,7 +226,7 @@ class Deployment:
         """
         cfg, path = self.cfg, self.path(number)
         if path.exists():
-            episode = read_episode(path)
+            episode = self._recorded(path)
             if episode.transitions:
                 self.operator.enter("ending", number)  # keys are about it
                 return from_episode(episode, number)
@@ -260,6 +260,17 @@ class Deployment:
         except BaseException:
             self._break_off(number)
             raise
+
+    def _recorded(self, path: Path) -> Episode:
+        """The rollout that an earlier process recorded, as far as it is whole.
+
+        Raises:
+            UserError: If nothing of it can be read.
+        """
+        try:
+            return read_episode(path)
+        except ValueError as error:
+            raise UserError(f"{error} Move it away: its rollout is then driven again.") from error
 
     def _driver(self, number: int) -> WorldModel:
         """The model that drives a rollout."""

@@ -12,7 +12,10 @@ from typing import Any, NamedTuple, Self, TextIO
 import numpy as np
 from tqdm import tqdm
 
+from mpc_sgft.command.errors import UserError
 from mpc_sgft.storage.whole_file import naming, write_whole
+
+AWAY = "Move it away to resume: later rows then go into a new one."
 
 
 class MetricLogger:
@@ -31,6 +34,7 @@ class MetricLogger:
 
     Raises:
         FileExistsError: If metrics.csv is there and resume_step is None.
+        UserError: If metrics.csv is there, and no table of metrics.
         ModuleNotFoundError: If wandb is asked for and not installed.
         OSError: With the path, if a file cannot be written, here or in log().
     """
@@ -118,12 +122,22 @@ class _CsvTable:
         self._file.close()
 
     def _read(self) -> list[dict[str, str]]:
-        """All whole rows; a row that a killed process left half written lacks its line end and is dropped."""
-        text = self._path.read_text()
-        rows = list(csv_file.reader(text[: text.rfind("\n") + 1].splitlines()))
-        if rows:
-            self._columns = rows[0]
-        return [dict(zip(self._columns, row, strict=True)) for row in rows[1:]]
+        """All whole rows. What a killed process left half written lacks its line end and is dropped.
+
+        Rows that are damaged, as after a power loss, are left out, and it is said how many.
+        """
+        text = self._path.read_text(errors="replace")
+        if not text.startswith("step"[: len(text)]):
+            raise UserError(f"{self._path} is no table of metrics: it starts with {text[:8]!r}. {AWAY}")
+        try:
+            header, *rows = [*csv_file.reader(text[: text.rfind("\n") + 1].splitlines())] or [self._columns]
+        except csv_file.Error as error:
+            raise UserError(f"{self._path} is damaged ({error}). {AWAY}") from error
+        self._columns = header
+        whole = [row for row in rows if len(row) == len(header) and row[0].isdecimal()]
+        if len(whole) < len(rows):
+            print(f"{self._path}: {len(rows) - len(whole)} damaged rows are left out", file=sys.stderr)
+        return [dict(zip(header, row, strict=True)) for row in whole]
 
     def _replace(self, rows: list[dict[str, str]]) -> None:
         """Write the whole table in place of the old one."""

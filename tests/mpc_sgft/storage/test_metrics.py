@@ -11,6 +11,7 @@ import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from mpc_sgft.command.errors import UserError
 from mpc_sgft.storage.metrics import GrowingTable, MetricLogger, progress
 
 
@@ -52,6 +53,21 @@ def test_resume_continues_as_if_never_interrupted(tmp_path):
         for step in (4, 5):
             logger.log(step, {"extra": 2 * step, "loss": step})
     assert path.read_text() == whole
+
+
+@pytest.mark.parametrize("content", [bytes(50), b"step,loss\n0," + bytes(200_000) + b"\n", b"\x89PNG"])
+def test_what_cannot_be_a_table_is_named_and_kept(tmp_path, content):
+    (tmp_path / "metrics.csv").write_bytes(content)
+    with pytest.raises(UserError, match="metrics.csv is .*Move it away"):
+        MetricLogger(tmp_path, tensorboard=False, resume_step=3)
+    assert (tmp_path / "metrics.csv").read_bytes() == content
+
+
+def test_damaged_rows_are_left_out(tmp_path, capsys):
+    (tmp_path / "metrics.csv").write_bytes(b"step,loss\n0,1.5\n1\n\0\0,2\n\xff,2\n2,0.5\n")
+    MetricLogger(tmp_path, tensorboard=False, resume_step=3).close()
+    assert [row["step"] for row in rows(tmp_path)] == ["0", "2"]
+    assert "metrics.csv: 3 damaged rows are left out" in capsys.readouterr().err
 
 
 def test_a_new_run_does_not_overwrite(tmp_path):
