@@ -105,6 +105,15 @@ def test_resume_refuses_words_that_do_not_exist(change: str, loops: Path, capsys
     assert "unknown {} '{}'".format(*change.split("=")) in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("content", [bytes(3000), b"\xff\xfe", b"seed: [1"])
+def test_a_config_that_is_damaged_is_one_line(content: bytes, loops: Path, capsys) -> None:
+    assert cli.run(probe("folder"), ["run_dir=first"]) == 0
+    (loops / "first" / "config.yaml").write_bytes(content)
+    assert cli.run(probe("folder"), ["--resume", "first"]) == 2
+    said = capsys.readouterr().err
+    assert "cannot resume first: its config.yaml is damaged (" in said and said.count("\n") == 1
+
+
 def test_resume_refuses_the_run_of_another_command(loops: Path, capsys) -> None:
     assert cli.run(probe("folder"), ["run_dir=first"]) == 0
     assert cli.run(probe("show", name="evaluate"), ["--resume", "first"]) == 2

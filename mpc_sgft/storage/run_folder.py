@@ -48,7 +48,7 @@ def start(cfg: DictConfig, root: Path | str = "runs") -> Path:
     folder = None
     try:
         folder = _new_folder(cfg.run_dir, root / task)
-        (folder / "config.yaml").write_text(OmegaConf.to_yaml(cfg, resolve=True))
+        write_whole(folder / "config.yaml", OmegaConf.to_yaml(cfg, resolve=True).encode())
         (folder / "versions.json").write_text(json.dumps(versions(), indent=2) + "\n")
     except OSError as err:
         place = folder or cfg.run_dir or root / task
