@@ -80,6 +80,7 @@ def test_groups_and_effects_are_the_files_on_disk() -> None:
         (["planner.temperature=hot"], ["a number is needed"]),
         (["eval_every=0"], ["eval_every=0: a whole number from 1 on"]),
         (["train.replay.batch_size=0"], ["train.replay.batch_size=0: a whole number from 1 on"]),
+        (["method.slice_len=0"], ["method.slice_len=0: a whole number from 1 on"]),
         (["warmup=-1"], ["warmup=-1: a whole number from 0 on"]),
         (["seed=-1"], ["a whole number"]),
         (["eval_seed=-1"], ["eval_seed=-1: a whole number"]),
@@ -185,7 +186,11 @@ def test_ctrl_c_shows_the_message_of_the_loop(loops: Path, capsys) -> None:
 
 def test_a_full_disk_is_a_clear_line(loops: Path, capsys) -> None:
     assert cli.run(probe("full"), []) == 2
-    assert "runs/x/metrics.csv: the disk is full" in capsys.readouterr().err
+    assert re.search(r"runs/x/metrics.csv: the disk is full\. .*another place with run_dir=", capsys.readouterr().err)
+    assert cli.run(probe("folder"), ["run_dir=first"]) == 0
+    assert cli.run(probe("full"), ["--resume", "first"]) == 2
+    said = capsys.readouterr().err
+    assert "the same --resume goes on" in said and "run_dir" not in said, "a resumed run is where it is"
 
 
 def test_errors_of_our_own_are_not_hidden(loops: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 from pathlib import Path
 
@@ -61,6 +62,17 @@ def test_resume_takes_the_saved_config_and_its_folder(loops: Path, capsys) -> No
     assert "cannot be resolved" in capsys.readouterr().err
 
 
+def test_what_a_resumed_run_is_told_does_not_fit_on_the_disk(loops: Path, monkeypatch, capsys) -> None:
+    def full(path: Path, data: bytes) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device", str(path))
+
+    assert cli.run(probe("folder"), ["run_dir=first"]) == 0
+    monkeypatch.setattr(run_folder, "write_whole", full)
+    assert cli.run(probe("folder"), ["--resume", "first", "horizon=3"]) == 2
+    said = capsys.readouterr().err
+    assert "first/config.yaml: the disk is full" in said and "the same --resume goes on" in said
+
+
 def test_a_resumed_run_changes_what_is_given_as_another_setting_too(loops: Path) -> None:
     def horizons(folder: str, *words: str) -> tuple[int, int]:
         cfg = resumed.resume("deploy", folder, [compose.normalise(word) for word in words], words)
@@ -91,6 +103,15 @@ def test_resume_refuses_words_that_do_not_exist(change: str, loops: Path, capsys
     assert cli.run(probe("folder"), ["run_dir=first"]) == 0
     assert cli.run(probe("show"), ["--resume", "first", change]) == 2
     assert "unknown {} '{}'".format(*change.split("=")) in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("content", [bytes(3000), b"\xff\xfe", b"seed: [1"])
+def test_a_config_that_is_damaged_is_one_line(content: bytes, loops: Path, capsys) -> None:
+    assert cli.run(probe("folder"), ["run_dir=first"]) == 0
+    (loops / "first" / "config.yaml").write_bytes(content)
+    assert cli.run(probe("folder"), ["--resume", "first"]) == 2
+    said = capsys.readouterr().err
+    assert "cannot resume first: its config.yaml is damaged (" in said and said.count("\n") == 1
 
 
 def test_resume_refuses_the_run_of_another_command(loops: Path, capsys) -> None:

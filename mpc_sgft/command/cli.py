@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 
 from mpc_sgft import __version__
 from mpc_sgft.command import choices
-from mpc_sgft.command.errors import Stopped, UserError, disk_error
+from mpc_sgft.command.errors import AGAIN, ELSEWHERE, Stopped, UserError, disk_error
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -70,14 +70,15 @@ def run(command: Command, argv: Sequence[str] | None = None) -> int:
         command: Which.
         argv: Arguments without the program's name; sys.argv[1:] if None.
     """
-    args = list(sys.argv[1:] if argv is None else argv)
+    args, then = list(sys.argv[1:] if argv is None else argv), ELSEWHERE
     try:
         flags, overrides = _parse(command, args)
+        then = ELSEWHERE if flags.resume is None else AGAIN
         return _run(command, flags, overrides)
     except UserError as err:
         return _fail(str(err), 2)
     except OSError as err:
-        message = disk_error(err)
+        message = disk_error(err, then)
         if message is None:
             raise
         return _fail(message, 2)

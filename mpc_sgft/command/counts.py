@@ -11,7 +11,7 @@ FROM_ZERO = (
 FROM_ONE = (
     *("episodes", "eval_every", "eval_episodes", "final_episodes", "save_every"),
     *("num_envs", "torch_threads", "transitions", "lr_halves_every", "target_streak"),
-    *("train.replay.capacity", "train.replay.slice_len", "train.replay.batch_size"),
+    *("train.replay.capacity", "train.replay.slice_len", "train.replay.batch_size", "method.slice_len"),
 )
 ABSENT = object()
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import errno
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from difflib import get_close_matches
 
@@ -16,6 +16,7 @@ DISK_ERRORS = {
     errno.EROFS: "the file system is read-only",
 }
 ELSEWHERE = "Earlier results are untouched; choose another place with run_dir=..."
+AGAIN = "Earlier results are untouched; once that is mended the same --resume goes on."
 
 
 class UserError(Exception):
@@ -79,3 +80,22 @@ def disk_error(err: OSError, then: str = ELSEWHERE) -> str | None:
         return None
     place = err.filename or "the run folder"
     return f"{place}: {DISK_ERRORS[err.errno]}. {then}"
+
+
+@contextmanager
+def disk_errors(then: Callable[[], str]) -> Iterator[None]:
+    """Report a full disk or a missing permission as the user's error; every other error comes out as it is.
+
+    Args:
+        then: Says what is safe, and what to do, as it is by then.
+
+    Raises:
+        UserError: With the file, why, and `then`.
+    """
+    try:
+        yield
+    except OSError as err:
+        message = disk_error(err, then())
+        if message is None:
+            raise
+        raise UserError(message) from err

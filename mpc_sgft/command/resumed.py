@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from omegaconf import DictConfig, OmegaConf
+from yaml import YAMLError
 
 from mpc_sgft.command import choices
 from mpc_sgft.command.compose import OPEN, check_key, check_kind, check_words, composed, parse, resolve
@@ -34,12 +35,19 @@ def resume(name: str, folder: str, overrides: Sequence[str], given: Sequence[str
         given: The overrides as the user wrote them.
 
     Raises:
-        UserError: If there is no such run, another command wrote it, or an override cannot be applied.
+        UserError: If there is no such run, another command wrote it, its config is damaged, or an override cannot be
+            applied.
     """
     path = Path(folder).resolve()
     if not (path / "config.yaml").is_file():
         raise UserError(f"cannot resume {folder}: no config.yaml in it. Give the run folder, e.g. runs/push/latest.")
-    cfg = OmegaConf.load(path / "config.yaml")
+    try:
+        cfg = OmegaConf.load(path / "config.yaml")
+    except (YAMLError, UnicodeDecodeError) as error:
+        raise UserError(
+            f"cannot resume {folder}: its config.yaml is damaged ({str(error).splitlines()[0]}). "
+            "Put that of a run with the same settings there, or start a run."
+        ) from error
     if not isinstance(cfg, DictConfig) or cfg.get("command") != name:
         wrote = cfg.get("command") if isinstance(cfg, DictConfig) else None
         raise UserError(f"cannot resume {folder} with {name}: {wrote or 'another program'} wrote it.")

@@ -36,7 +36,7 @@ def write_audit(path: Path, rollout: int, steps: TensorDict, margin: Tensor, nam
 
     A negative margin is not improvable, an empty one was not asked.
     """
-    fresh = not path.exists()
+    fresh = not path.exists() or not path.stat().st_size  # a full disk leaves an empty one
     with path.open("a", newline="") as file:
         writer = csv.writer(file)
         if fresh:

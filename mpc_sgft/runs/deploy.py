@@ -15,7 +15,7 @@ from tensordict import TensorDict
 
 from envs.backends.base import BackendError
 from envs.env import ControlEnv
-from mpc_sgft.command.errors import Stopped, UserError, disk_error, from_config
+from mpc_sgft.command.errors import Stopped, UserError, disk_errors, from_config
 from mpc_sgft.learning.agent import Agent
 from mpc_sgft.learning.audit import audit, write_audit
 from mpc_sgft.learning.observation_map import Sensed
@@ -32,9 +32,10 @@ from mpc_sgft.session.keyboard import ending_in_order
 from mpc_sgft.session.operator import Nobody, Operator
 from mpc_sgft.session.verdicts import Verdicts
 from mpc_sgft.storage import checkpoint, run_folder
-from mpc_sgft.storage.episode_file import read_episode
+from mpc_sgft.storage.episode_file import Episode, read_episode
 from mpc_sgft.storage.metrics import GrowingTable, MetricLogger, progress
 from mpc_sgft.storage.rollout import Rollout, from_episode
+from mpc_sgft.storage.whole_file import naming
 from mpc_sgft.views.deploy_view import DeployViewer
 
 
@@ -51,7 +52,8 @@ def deploy(cfg: DictConfig) -> int:
             return robot.dry_run(cfg, agent.model, env)
         run = Deployment(cfg, agent, env, None if real else build.make_env(cfg, cfg.eval_episodes), operator)
         try:
-            summary = run.loop()
+            with disk_errors(lambda: f"Make room. Every whole step is on disk, {run.how_to_go_on()}"):
+                summary = run.loop()
         except Stopped:
             raise
         except KeyboardInterrupt as error:  # a second Ctrl-C
@@ -60,16 +62,10 @@ def deploy(cfg: DictConfig) -> int:
             with suppress(OSError):
                 print(f"\n{run.how_to_go_on()}", file=sys.stderr)
             raise
-        except BackendError as error:
+        except BackendError as error:  # closing the backend, on the way out, brings the arm to rest
             if operator.stopping or run.stop.asked:
                 raise Stopped(run.how_to_go_on()) from error
             raise UserError(f"{error} {run.how_to_go_on()}") from error
-        except OSError as error:  # closing the backend, on the way out, brings the arm to rest
-            then = f"Make room. Every whole step is on disk, {run.how_to_go_on()}"
-            message = disk_error(error, then)
-            if message is None:
-                raise
-            raise UserError(message) from error
         finally:
             run.stop.restore()
     print(json.dumps(summary))
@@ -86,10 +82,15 @@ def make_transfer(
     """A pretrained agent in the hands of `cfg.method`; simulated episodes are those of pretraining, if not given.
 
     Raises:
-        UserError: For a number that the method refuses.
+        UserError: For a number that the method refuses, or where it learns and no episode holds one of its slices.
     """
     with from_config("method"):
         method = instantiate(cfg.method, _convert_="all")
+    if method.updates and not 1 <= method.slice_len <= episode_steps:
+        raise UserError(
+            f"method.slice_len={method.slice_len}: an episode of {episode_steps} steps holds no such slice. "
+            f"Give 1 to {episode_steps}."
+        )
     return Transfer(
         agent,
         method,
@@ -134,8 +135,6 @@ class Deployment:
         self.logger = self.make_logger(self.state["rollouts"] if cfg.resume is not None else None)
         self.metrics: dict[str, float] = {}  # of the last rollout
         self.verdicts = Verdicts(self, ask=person.asks(cfg))
-        self.stop = StopRequest("rollout")
-        self.operator.heed(lambda: self.stop.asked)
         self.viewer = (
             DeployViewer(self.folder / "run.rrd", env, megabytes=cfg.log.rerun_mb, resume=bool(cfg.resume))
             if cfg.log.rerun
@@ -143,6 +142,8 @@ class Deployment:
         )
         self.began = time.monotonic() - self.state["seconds"]
         run_folder.keep_told(cfg, self.folder)
+        self.stop = StopRequest("rollout")  # last: what is refused until then leaves Ctrl-C as it was
+        self.operator.heed(lambda: self.stop.asked)
 
     def loop(self) -> dict[str, Any]:
         """Run what is left, and write the summary."""
@@ -230,7 +231,7 @@ class Deployment:
         """
         cfg, path = self.cfg, self.path(number)
         if path.exists():
-            episode = read_episode(path)
+            episode = self._recorded(path)
             if episode.transitions:
                 self.operator.enter("ending", number)  # keys are about it
                 return from_episode(episode, number)
@@ -265,6 +266,17 @@ class Deployment:
             self._break_off(number)
             raise
 
+    def _recorded(self, path: Path) -> Episode:
+        """The rollout that an earlier process recorded, as far as it is whole.
+
+        Raises:
+            UserError: If nothing of it can be read.
+        """
+        try:
+            return read_episode(path)
+        except ValueError as error:
+            raise UserError(f"{error} Move it away: its rollout is then driven again.") from error
+
     def _driver(self, number: int) -> WorldModel:
         """The model that drives a rollout."""
         return self.transfer.pretrained if number <= self.cfg.warmup else self.transfer.acting
@@ -295,8 +307,10 @@ class Deployment:
         model, horizon = self._driver(number), self.cfg.planner.horizon
         error = open_loop_error(model, rollout.steps, horizon)
         found = audit(model, rollout.steps, self.cfg.task.discount, seed=number)
-        forget_audit(self.folder / "audit.csv", number)  # a process that was killed while it learned had written it
-        write_audit(self.folder / "audit.csv", number, rollout.steps, found.margin, self.env.task.observation_names)
+        path, names = self.folder / "audit.csv", self.env.task.observation_names
+        forget_audit(path, number)  # a process that was killed while it learned had written it
+        with naming(path):
+            write_audit(path, number, rollout.steps, found.margin, names)
         metrics = {
             "real_success": float(rollout.success),
             "real_return": float(rollout.steps["next", "reward"].sum()),

@@ -8,6 +8,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from types import FrameType
 
 import torch
@@ -16,7 +17,7 @@ from omegaconf import DictConfig
 
 from envs.backends.sim import cores
 from envs.env import ControlEnv
-from mpc_sgft.command.errors import Stopped, UserError, from_config
+from mpc_sgft.command.errors import Stopped, UserError, disk_errors, from_config
 from mpc_sgft.learning.agent import Agent
 from mpc_sgft.learning.buffer import SliceBuffer
 from mpc_sgft.learning.row_buffer import RowBuffer
@@ -33,6 +34,13 @@ EVAL_SEED = 1_000_000  # of evaluation episodes: far from what a pretraining wit
 def pretrain(cfg: DictConfig) -> int:
     """Pretrain until the target success is held or the transitions are spent; returns the exit code."""
     folder = run_folder.start(cfg)
+    go_on = f"python -m mpc_sgft.pretrain --resume {folder}"
+    with disk_errors(lambda: f"Make room. What was saved is whole. Go on: {go_on}"):
+        return _pretrain(cfg, folder, go_on)
+
+
+def _pretrain(cfg: DictConfig, folder: Path, go_on: str) -> int:
+    """As `pretrain`, in its folder; `go_on` is the command that continues."""
     build.prepare_process(cfg)
     check_exploration(cfg)
     judge = build.make_env(cfg, cfg.eval_episodes, randomised=True)
@@ -78,7 +86,7 @@ def pretrain(cfg: DictConfig) -> int:
         parts["curriculum"] = None if curriculum is None else curriculum.state_dict()
         checkpoint.save_state(saved, {**parts, "agent": agent.state_dict(), "buffer": buffer.state_dict()})
 
-    stop, go_on = StopRequest("round"), f"python -m mpc_sgft.pretrain --resume {folder}"
+    stop = StopRequest("round")
     logger = MetricLogger(
         folder,
         csv=cfg.log.csv,

@@ -1,12 +1,14 @@
 """What a person says of an episode that is over: marked in its file, or set aside to be driven again."""
 
 import csv
+import io
 import os
 from collections.abc import Iterable
 from pathlib import Path
 
 from mpc_sgft.storage.episode_file import EpisodeWriter, read_episode, scan
 from mpc_sgft.storage.rollout import Press
+from mpc_sgft.storage.whole_file import write_whole
 
 
 def amend(path: Path, presses: Iterable[Press], success: bool | None) -> None:
@@ -53,8 +55,7 @@ def forget_audit(path: Path, rollout: int) -> None:
     if not path.exists():
         return
     with path.open(newline="") as file:
-        rows = [row for row in csv.reader(file) if row[0] != str(rollout)]
-    beside = path.with_suffix(".csv.new")
-    with beside.open("w", newline="") as file:
-        csv.writer(file).writerows(rows)
-    os.replace(beside, path)
+        rows = [row for row in csv.reader(file) if row[:1] != [str(rollout)]]
+    text = io.StringIO(newline="")
+    csv.writer(text).writerows(rows)
+    write_whole(path, text.getvalue().encode())

@@ -8,9 +8,10 @@ full disk or a kill leaves the earlier one.
 import hashlib
 import io
 import json
+import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 import safetensors.torch
 import torch
@@ -89,13 +90,11 @@ def load(
         device: Where the model goes.
 
     Raises:
-        CheckpointError: If there is no such file, it is corrupt, or it is for another task, size or format.
+        CheckpointError: If the file is missing, unreadable or corrupt, or for another task, size or format.
     """
-    file = Path(path) / WEIGHTS if Path(path).is_dir() else Path(path)
-    if not file.is_file():
-        raise CheckpointError(
-            f"No checkpoint at {file}. Give a run folder of a finished pretrain, or a .safetensors file."
-        )
+    file = Path(path) / WEIGHTS if os.path.isdir(path) else Path(path)
+    missing = f"No checkpoint at {file}. Give a run folder of a finished pretrain, or a .safetensors file."
+    _opened(file, missing).close()  # safe_open says of a file that may not be read that there is none
     try:
         with safe_open(file, framework="pt") as opened:
             header = opened.metadata() or {}
@@ -104,7 +103,7 @@ def load(
         found = {"format": meta["format"], "task": meta["task"], **meta["sizes"]}
     except KeyError as err:
         raise CheckpointError(f"{file} has no {err} in its header: it was not written by mpc_sgft. {_AGAIN}") from err
-    except (SafetensorError, OSError, ValueError, TypeError) as err:
+    except (SafetensorError, ValueError, TypeError) as err:
         raise CheckpointError(f"{file} is corrupt ({err}). {_AGAIN}") from err
     own = meta["task"] if meta["task"] in tasks else next(iter(tasks), meta["task"])
     expected = {"format": FORMAT, "task": own, **(sizes or {})}
@@ -152,12 +151,11 @@ def load_state(path: Path | str) -> dict[str, Any]:
     """Read what `save_state` wrote; runs no code from the file.
 
     Raises:
-        CheckpointError: If there is no such file or it is corrupt.
+        CheckpointError: If there is no such file, it cannot be read or is corrupt.
     """
     file = Path(path)
-    if not file.is_file():
-        raise CheckpointError(f"No saved state at {file}. Start the run again without --resume.")
-    raw = file.read_bytes()
+    with _opened(file, f"No saved state at {file}. Start the run again without --resume.") as opened:
+        raw = opened.read()
     digest, data = raw[:DIGEST_BYTES], raw[DIGEST_BYTES:]
     if hashlib.sha256(data).digest() != digest:
         raise CheckpointError(f"{file} is corrupt: its content does not match its checksum. {_AGAIN}")
@@ -165,6 +163,17 @@ def load_state(path: Path | str) -> dict[str, Any]:
 
 
 _AGAIN = "Use another checkpoint or train again."
+
+
+def _opened(file: Path, missing: str) -> BinaryIO:
+    """A file to be read; `missing` is what to say where there is none."""
+    try:
+        return open(file, "rb")
+    except (FileNotFoundError, NotADirectoryError, IsADirectoryError) as err:
+        raise CheckpointError(missing) from err
+    except OSError as err:
+        message = f"{file} cannot be read: {err.strerror}. Make it readable, or use another checkpoint or run."
+        raise CheckpointError(message) from err
 
 
 def _digest(tensors: Mapping[str, Tensor]) -> str:

@@ -24,8 +24,8 @@ from types import TracebackType
 from typing import Any, BinaryIO, NamedTuple, Self
 
 import numpy as np
-from mcap.exceptions import EndOfFile, InvalidMagic, McapError
-from mcap.records import Channel, Footer, Message
+from mcap.exceptions import EndOfFile, McapError
+from mcap.records import Channel, DataEnd, Footer, Message, Statistics
 from mcap.stream_reader import CRCValidationError, StreamReader
 from mcap.well_known import MessageEncoding, SchemaEncoding
 from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
@@ -45,6 +45,8 @@ TRANSITION_KEYS = (
 JOINT_KEYS = ("time", "qpos", "qvel", "ctrl", "force")
 HIDDEN_KEYS = ("gap", "effects")
 TOPICS = ("/metadata", "/transition", "/joints", "/outcome", "/keys", "/guided")
+STEP_TOPICS = ("/transition", "/joints")
+DAMAGE = (McapError, CRCValidationError, UnicodeDecodeError, ZstdError, MemoryError, OverflowError)  # lengths, too
 
 
 class Episode(NamedTuple):
@@ -119,11 +121,12 @@ class EpisodeWriter:
         """Append one control step and flush it.
 
         Args:
-            transition: TRANSITION_KEYS -> number or array; more keys are welcome, the same ones in every step.
+            transition: TRANSITION_KEYS -> number or array; more keys are welcome, the same ones in every step. `step`
+                counts from 0: by it a step that is missing in the file is noticed.
             joints: `time` [S] in seconds and any of JOINT_KEYS, each [S, …]; None if the backend has no such samples.
 
         Raises:
-            ValueError: If a key is missing, lengths differ, or the episode is closed.
+            ValueError: If a key is missing, `step` is not the next one, lengths differ, or the episode is closed.
             OSError: If the step could not be written; the episode then ends with the step before.
         """
         missing = [key for key in TRANSITION_KEYS if key not in transition]
@@ -134,6 +137,10 @@ class EpisodeWriter:
             changed = sorted(self._keys ^ set(transition))
             raise ValueError(f"Transition {self.steps} differs from the first one in {changed}: keep the same keys.")
         arrays = {key: np.asarray(value) for key, value in transition.items()}
+        if arrays["step"].item() != self.steps:
+            raise ValueError(
+                f"Transition {self.steps} has step={arrays['step'].item()}; steps count from 0 without gaps."
+            )
         self._time = round(float(arrays["time"].item()) * 1e9)
         messages = {"/transition": _dumps({key: array.tolist() for key, array in arrays.items()}, arrays)}
         if joints is not None:
@@ -147,17 +154,20 @@ class EpisodeWriter:
 
     def key(self, word: str, *, time: float, unix: float) -> None:
         """Append a key that a person pressed: when since the episode's start, and by the computer's clock, [s]."""
-        self._write({"/keys": _dumps({"key": word, "time": time, "unix": unix})})
+        pressed = max(self._time, round(time * 1e9))
+        self._write({"/keys": _dumps({"key": word, "time": time, "unix": unix})}, time=pressed)
 
     def guided(self, samples: Mapping[str, Any]) -> None:
-        """Append what was measured while a person moved the arm, each [S, …]."""
+        """Append what was measured while a person moved the arm, each [S, …], `time` [s] among it."""
         arrays = {key: np.asarray(value) for key, value in samples.items()}
+        self._time = max(self._time, round(float(arrays["time"].max(initial=0.0)) * 1e9))
         self._write({"/guided": _dumps({key: array.tolist() for key, array in arrays.items()}, arrays)})
 
     def copy(self, topic: str, time: int, data: bytes) -> None:
         """Append a message of another episode as it is."""
         self._time = time  # [ns]
-        self._write({topic: data.decode()})
+        self._write({topic: data.decode()}, step=self.steps - (topic == "/joints"))  # which follow their transition
+        self.steps += topic == "/transition"
 
     def close(self, outcome: Mapping[str, Any]) -> None:
         """Write the outcome (success, return, reason it ended, …) and the file's index, then close it."""
@@ -187,13 +197,15 @@ class EpisodeWriter:
         schema_id = self._writer.register_schema(f"mpc_sgft.{topic.strip('/')}", SchemaEncoding.JSONSchema, data)
         return self._writer.register_channel(topic, MessageEncoding.JSON, schema_id)
 
-    def _write(self, messages: Mapping[str, str]) -> None:
+    def _write(self, messages: Mapping[str, str], *, time: int | None = None, step: int | None = None) -> None:
+        """Append messages of one time [ns] and flush them; None: of the time that was reached, and the next step."""
+        time, step = self._time if time is None else time, self.steps if step is None else step
         if self._file is None:
             raise ValueError(f"The episode {self.path} is closed: nothing can be added to it.")
         try:
             for topic, text in messages.items():
                 channel = self._channels[topic]
-                self._writer.add_message(channel, self._time, text.encode(), self._time, sequence=self.steps)
+                self._writer.add_message(channel, time, text.encode(), time, sequence=step)
             self._writer.flush()
         except OSError as error:
             raise self._failed(error) from error
@@ -211,19 +223,23 @@ def read_episode(path: str | Path) -> Episode:
     """Read an episode, also one whose writer was killed or whose file was cut.
 
     Returns:
-        Everything up to the last whole step; see Episode.
+        Everything up to the last whole step, or the first one that is missing; see Episode.
 
     Raises:
         ValueError: If the file is not an MCAP episode at all.
         OSError: If it cannot be opened.
     """
-    found = scan(path)
+    found, problem = scan(path), ""
     messages: dict[str, list[dict[str, Any]]] = {topic: [] for topic in TOPICS}
     for topic, _, data in found.messages:
-        messages[topic].append(json.loads(data))
-    steps = len(messages["/transition"])
-    complete = found.closed and not found.problem and bool(messages["/outcome"])
-    lost = f"{found.problem}: {steps} whole steps kept, the last {found.unreadable} of {found.size} bytes unreadable"
+        row, steps = json.loads(data), len(messages["/transition"])
+        if topic == "/transition" and row["step"] not in (steps, [steps]):
+            problem = f"step {steps} is missing"
+        if not problem or topic not in STEP_TOPICS:
+            messages[topic].append(row)
+    steps, problem = len(messages["/transition"]), problem or found.problem
+    complete = found.closed and not problem and bool(messages["/outcome"])
+    lost = f"{problem}: {steps} whole steps kept, the last {found.unreadable} of {found.size} bytes unreadable"
     return Episode(
         metadata=messages["/metadata"][0] if messages["/metadata"] else {},
         transitions=_stack([{k: [v] for k, v in row.items()} for row in messages["/transition"]]),
@@ -237,7 +253,7 @@ def read_episode(path: str | Path) -> Episode:
 
 
 def scan(path: str | Path) -> Scan:
-    """The whole messages of a file, and how it ends.
+    """The whole messages of a file, and how it ends. One that lacks messages which its index counts has a problem.
 
     Raises:
         ValueError: If the file is not an MCAP episode at all.
@@ -247,25 +263,31 @@ def scan(path: str | Path) -> Scan:
     size = path.stat().st_size
     topics: dict[int, str] = {}
     messages: list[tuple[str, int, bytes]] = []
-    whole, closed, problem = 0, False, ""
+    whole, closed, problem, seen, counted = 0, False, "", 0, None
     with path.open("rb") as file:
         head = file.read(len(MCAP0_MAGIC))
         file.seek(0)
         if not MCAP0_MAGIC.startswith(head):
             raise ValueError(f"{path} is not an MCAP file: it starts with {head!r}.")
-        source = _WholeReads(file)
+        source, index = _WholeReads(file, size), False
         try:
             for record in StreamReader(source, validate_crcs=True, record_size_limit=size).records:  # pyright: ignore
                 whole = file.tell()
                 if isinstance(record, Channel):
                     topics[record.id] = record.topic
-                elif isinstance(record, Message) and topics.get(record.channel_id) in TOPICS:
-                    messages.append((topics[record.channel_id], record.log_time, record.data))
-                closed = isinstance(record, Footer)
+                elif isinstance(record, Message) and not index:
+                    seen += 1
+                    if topics.get(record.channel_id) in TOPICS:
+                        messages.append((topics[record.channel_id], record.log_time, record.data))
+                elif isinstance(record, Statistics):
+                    counted = record.message_count
+                index, closed = index or isinstance(record, DataEnd), isinstance(record, Footer)
+            if seen != counted:
+                problem = f"it is damaged (its index does not count the {seen} messages that are whole)"
         except EndOfFile:
             problem = "it was never closed" if whole == size else "it ends in the middle of a record"
-        except (InvalidMagic, CRCValidationError, McapError, ZstdError) as error:
-            problem = f"it is damaged ({error})"
+        except DAMAGE as error:
+            problem = f"it is damaged ({str(error) or type(error).__name__})"
     if (topics or closed) and not set(TOPICS) & set(topics.values()):
         raise ValueError(f"{path} is an MCAP file without the topics {list(TOPICS)}: not an episode of this project.")
     return Scan(messages, closed, problem, size - whole, size)
@@ -274,11 +296,11 @@ def scan(path: str | Path) -> Scan:
 class _WholeReads:
     """A binary file whose short reads are the end of the file, which is what mcap's parser expects of its source."""
 
-    def __init__(self, file: BinaryIO) -> None:
-        self._file = file
+    def __init__(self, file: BinaryIO, size: int) -> None:
+        self._file, self._size = file, size
 
     def read(self, length: int) -> bytes:
-        data = self._file.read(length)
+        data = self._file.read(length) if length <= self._size else b""  # no room is made for a damaged length
         if len(data) < length:
             raise EndOfFile()
         return data

@@ -1,8 +1,8 @@
 """Numbers of a run on their way to metrics.csv, TensorBoard, wandb and the terminal."""
 
 import csv as csv_file
+import io
 import math
-import os
 import sys
 import time
 from collections.abc import Mapping
@@ -11,6 +11,11 @@ from typing import Any, NamedTuple, Self, TextIO
 
 import numpy as np
 from tqdm import tqdm
+
+from mpc_sgft.command.errors import UserError
+from mpc_sgft.storage.whole_file import naming, write_whole
+
+AWAY = "Move it away to resume: later rows then go into a new one."
 
 
 class MetricLogger:
@@ -29,6 +34,7 @@ class MetricLogger:
 
     Raises:
         FileExistsError: If metrics.csv is there and resume_step is None.
+        UserError: If metrics.csv is there, and no table of metrics.
         ModuleNotFoundError: If wandb is asked for and not installed.
         OSError: With the path, if a file cannot be written, here or in log().
     """
@@ -45,12 +51,13 @@ class MetricLogger:
         run_dir = Path(run_dir)
         self._csv = _CsvTable(run_dir / "metrics.csv", resume_step) if csv else None
         self._wandb = _wandb_run(run_dir, resume_step) if wandb else None
-        self._board = None
+        self._board, self._board_dir = None, run_dir / "tensorboard"
         if tensorboard:
             from torch.utils.tensorboard import SummaryWriter  # imports torch: late, so that --help stays quick
 
             purge = None if resume_step is None else resume_step + 1
-            self._board = SummaryWriter(str(run_dir / "tensorboard"), purge_step=purge)
+            with naming(self._board_dir):
+                self._board = SummaryWriter(str(self._board_dir), purge_step=purge)
 
     def log(self, step: int, values: Mapping[str, Any]) -> None:
         """Append one row.
@@ -66,9 +73,10 @@ class MetricLogger:
         if self._csv is not None:
             self._csv.append(step, row)
         if self._board is not None:
-            for name, value in row.items():
-                self._board.add_scalar(name, value, step)
-            self._board.flush()
+            with naming(self._board_dir):
+                for name, value in row.items():
+                    self._board.add_scalar(name, value, step)
+                self._board.flush()
         if self._wandb is not None:
             self._wandb.log(row, step=step)
 
@@ -114,29 +122,36 @@ class _CsvTable:
         self._file.close()
 
     def _read(self) -> list[dict[str, str]]:
-        """All whole rows; a row that a killed process left half written lacks its line end and is dropped."""
-        text = self._path.read_text()
-        rows = list(csv_file.reader(text[: text.rfind("\n") + 1].splitlines()))
-        if rows:
-            self._columns = rows[0]
-        return [dict(zip(self._columns, row, strict=True)) for row in rows[1:]]
+        """All whole rows. What a killed process left half written lacks its line end and is dropped.
+
+        Rows that are damaged, as after a power loss, are left out, and it is said how many.
+        """
+        text = self._path.read_text(errors="replace")
+        if not text.startswith("step"[: len(text)]):
+            raise UserError(f"{self._path} is no table of metrics: it starts with {text[:8]!r}. {AWAY}")
+        try:
+            header, *rows = [*csv_file.reader(text[: text.rfind("\n") + 1].splitlines())] or [self._columns]
+        except csv_file.Error as error:
+            raise UserError(f"{self._path} is damaged ({error}). {AWAY}") from error
+        self._columns = header
+        whole = [row for row in rows if len(row) == len(header) and row[0].isdecimal()]
+        if len(whole) < len(rows):
+            print(f"{self._path}: {len(rows) - len(whole)} damaged rows are left out", file=sys.stderr)
+        return [dict(zip(header, row, strict=True)) for row in whole]
 
     def _replace(self, rows: list[dict[str, str]]) -> None:
-        """Write the whole table beside the old one, then swap, so that no moment exists without a whole file."""
-        beside = self._path.with_suffix(".csv.new")
-        with beside.open("w", newline="") as file:
-            writer = csv_file.writer(file, lineterminator="\n")
-            writer.writerow(self._columns)
-            writer.writerows([row.get(name, "") for name in self._columns] for row in rows)
-        os.replace(beside, self._path)
+        """Write the whole table in place of the old one."""
+        text = io.StringIO(newline="")
+        writer = csv_file.writer(text, lineterminator="\n")
+        writer.writerow(self._columns)
+        writer.writerows([row.get(name, "") for name in self._columns] for row in rows)
+        write_whole(self._path, text.getvalue().encode())
         self._file = self._path.open("a", newline="")
 
     def _write(self, rows: list[list[str]]) -> None:
-        try:
+        with naming(self._path):
             csv_file.writer(self._file, lineterminator="\n").writerows(rows)
             self._file.flush()
-        except OSError as error:
-            raise OSError(error.errno, error.strerror, str(self._path)) from error
 
 
 def _scalar(name: str, value: Any) -> float:

@@ -17,10 +17,11 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from mpc_sgft import __version__
-from mpc_sgft.command.errors import UserError, disk_error
+from mpc_sgft.command.errors import AGAIN, UserError, disk_error
 from mpc_sgft.storage.whole_file import write_whole
 
 PACKAGES = "torch torchrl tensordict mujoco gymnasium numpy scipy hydra-core safetensors mcap rerun-sdk".split()
+SUMMARY = "summary.json"  # inside a run folder
 
 
 def start(cfg: DictConfig, root: Path | str = "runs") -> Path:
@@ -47,7 +48,7 @@ def start(cfg: DictConfig, root: Path | str = "runs") -> Path:
     folder = None
     try:
         folder = _new_folder(cfg.run_dir, root / task)
-        (folder / "config.yaml").write_text(OmegaConf.to_yaml(cfg, resolve=True))
+        write_whole(folder / "config.yaml", OmegaConf.to_yaml(cfg, resolve=True).encode())
         (folder / "versions.json").write_text(json.dumps(versions(), indent=2) + "\n")
     except OSError as err:
         place = folder or cfg.run_dir or root / task
@@ -60,9 +61,10 @@ def start(cfg: DictConfig, root: Path | str = "runs") -> Path:
 
 
 def keep_told(cfg: DictConfig, folder: Path) -> None:
-    """Write what a resumed run is told now into its config.yaml, so that it holds the next time.
+    """Write what a resumed run is told now into its config.yaml, so that it holds the next time, and go on with it.
 
-    Call it when all is built and loaded: what is refused until then changes nothing. A new run's file stays.
+    A summary that is there is taken away: it is of a run that was finished. Call it when all is built and loaded: what
+    is refused until then changes nothing. A new run's file stays.
 
     Raises:
         UserError: If it cannot be written.
@@ -72,8 +74,9 @@ def keep_told(cfg: DictConfig, folder: Path) -> None:
     told = OmegaConf.to_yaml(OmegaConf.merge(cfg, {"resume": None}), resolve=True)
     try:
         write_whole(folder / "config.yaml", told.encode())
+        (folder / SUMMARY).unlink(missing_ok=True)
     except OSError as err:
-        raise UserError(disk_error(err) or f"{err.filename}: {err.strerror}.") from err
+        raise UserError(disk_error(err, AGAIN) or f"{err.filename}: {err.strerror}. {AGAIN}") from err
 
 
 def _new_folder(run_dir: str | None, parent: Path) -> Path:
@@ -109,7 +112,7 @@ def _link(link: Path, folder: Path) -> None:
 
 def write_summary(folder: Path, summary: dict[str, Any]) -> None:
     """summary.json, whole or not at all: who finds it takes the run as finished."""
-    write_whole(folder / "summary.json", (json.dumps(summary, indent=2) + "\n").encode())
+    write_whole(folder / SUMMARY, (json.dumps(summary, indent=2) + "\n").encode())
 
 
 def versions() -> dict[str, Any]:

@@ -32,7 +32,8 @@ import numpy as np
 import rerun as rr
 from rerun.chunk import Chunk, RrdReader
 
-from mpc_sgft.storage.whole_file import write_whole
+from mpc_sgft.command.errors import UserError
+from mpc_sgft.storage.whole_file import naming, write_whole
 from mpc_sgft.views.blueprint import Layout, blueprint
 from mpc_sgft.views.episode_view import Candidates, EpisodeView, Rows, log_episode, log_series_styles
 from mpc_sgft.views.robot_view import RobotView
@@ -42,6 +43,7 @@ __all__ = ["Candidates", "EpisodeView", "Layout", "RunViewer"]
 
 RRD_MAGIC, RRD_HEADER = b"RRF", 12  # how a file begins; bytes before its first frame
 NOT_COUNTED = "does not count: it is driven again"
+AWAY = "Move it away to resume: what is drawn then goes into a new one."
 NOT_DRAWN = " (not drawn: this file is bounded by log.rerun_mb)"
 RRD_FRAME, RRD_FOOTER = struct.Struct("<QQ"), 0  # kind and length of a frame; the kind after the last message
 
@@ -60,6 +62,7 @@ class RunViewer:
 
     Raises:
         FileExistsError: If the file is there and resume is False.
+        UserError: If a file to go on with is no rerun recording, or damaged; it then stays where it was.
         OSError: If the file cannot be written; also from episode(), metrics(), value_map() and close().
     """
 
@@ -231,11 +234,9 @@ class RunViewer:
         self._recording.reset_time()
         new = self._stream.read() or b""  # a whole file: header, messages, footer
         data = new[0 if self._file.tell() == 0 else RRD_HEADER : _end_of_messages(new)]
-        try:
+        with naming(self.path):
             while data:
                 data = data[self._file.write(data) :]
-        except OSError as error:
-            raise OSError(error.errno, error.strerror, str(self.path)) from error
 
 
 def _end_of_messages(data: bytes) -> int:
@@ -253,7 +254,7 @@ def _set_aside(path: Path, aside: Path) -> list[Chunk]:
     """Move the file of a resumed run to `aside` and return what it holds.
 
     Raises:
-        OSError: If it is no rerun recording; it then stays where it was.
+        UserError: If it is no rerun recording, or damaged; it then stays where it was.
     """
     source = aside if aside.exists() else path  # aside is there if an earlier take-over was killed: it holds more
     if not source.exists():
@@ -270,16 +271,23 @@ def _chunks(path: Path) -> list[Chunk]:
     """What a file holds, without a half-written message at its end.
 
     Raises:
-        OSError: If it is no rerun recording.
+        UserError: If it is no rerun recording, or damaged.
     """
     data = path.read_bytes()
     if data[: len(RRD_MAGIC)] != RRD_MAGIC[: len(data)]:
-        raise OSError(f"{path} is no rerun recording: it starts with {data[:4]!r}. Move it away to resume.")
+        raise UserError(f"{path} is no rerun recording: it starts with {data[:4]!r}. {AWAY}")
     whole = _end_of_messages(data)
+    if not any(data[whole : whole + RRD_FRAME.size]) and any(data[whole:]):  # no footer
+        raise UserError(f"{path} is damaged: only zeros at byte {whole}, and more after them. {AWAY}")
     if whole <= RRD_HEADER:
         return []
     with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*no footer.*")  # only `close` writes one
         readable = Path(folder) / path.name
-        readable.write_bytes(data[:whole])
-        return RrdReader(readable).stream().to_chunks()
+        with naming(readable):
+            readable.write_bytes(data[:whole])
+        try:
+            return RrdReader(readable).stream().to_chunks()
+        except RuntimeError as error:
+            said = str(error).replace(str(readable), path.name).partition("\n")[0]
+            raise UserError(f"{path} is damaged ({said}). {AWAY}") from error

@@ -33,6 +33,15 @@ def test_states_without_a_value_or_a_reading_are_not_asked(tmp_path):
     assert float(rows[0]["margin"]) == pytest.approx(float(whole.margin[0]), abs=1e-4)
 
 
+def test_a_table_that_a_full_disk_left_empty_begins_with_its_names(tmp_path):
+    path, steps = tmp_path / "audit.csv", rollout([False], [False])
+    path.touch()
+    for number in (1, 2):
+        write_audit(path, number, steps, torch.zeros(1), ("x", "y", "z"))
+    lines = path.read_text().splitlines()
+    assert lines[0] == "rollout,step,x,y,z,margin" and [line[0] for line in lines[1:]] == ["1", "2"]
+
+
 def test_a_rollout_of_nothing_to_ask_has_no_share():
     found = audit(WorldModel(**SIZES).eval(), rollout([True], [False]), 0.95, seed=1)
     assert found.share != found.share and found.margin.isnan().all()

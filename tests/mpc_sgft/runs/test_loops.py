@@ -3,6 +3,7 @@
 import contextlib
 import copy
 import csv
+import errno
 import io
 import json
 import os
@@ -114,6 +115,18 @@ def test_a_run_that_stopped_before_it_saved_begins_again(pretrained, tmp_path):
     weights, again = (load_file(f / "checkpoint" / "model.safetensors") for f in (pretrained, tmp_path / "r"))
     assert all((weights[k] == again[k]).all() for k in weights)
     assert [r["updates"] for r in rows(tmp_path / "r")] == [r["updates"] for r in rows(pretrained)]
+
+
+def test_a_disk_that_fills_up_ends_pretraining_with_how_to_go_on(tmp_path, monkeypatch):
+    def full(path, state):
+        raise OSError(errno.ENOSPC, "No space left on device", str(path))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(checkpoint, "save_state", full)
+        done = here("pretrain", f"run_dir={tmp_path / 'r'}", "transitions=320", "collector=inline")
+    assert done.returncode == 2 and "checkpoint/state.pt: the disk is full" in done.stderr, done.stderr
+    assert f"--resume {tmp_path / 'r'}" in done.stderr and "run_dir=" not in done.stderr
+    assert here("pretrain", "--resume", str(tmp_path / "r")).returncode == 0
 
 
 def test_a_final_evaluation_that_was_left_plans_with_the_range_of_what_was_learned(tmp_path, monkeypatch):
@@ -377,6 +390,7 @@ def test_the_scripted_pendulum_swings_up(tmp_path):
         (["gap.effects.actuator_gain.gain=99"], "-5"),
         (["gap.effects.actuator_gain.gian=0.5"], "gain"),
         (["method.win_stay=null"], "win_stay=None must be 0 or more"),
+        (["method.slice_len=41"], "method.slice_len=41: an episode of 40 steps holds no such slice"),
         (["planner.num_elites=100000"], "num_elites"),
         (["model=5M"], "latent_dim"),
         (["train=recurrent_dr"], "train=recurrent_dr begins a policy anew"),
@@ -398,7 +412,8 @@ def test_what_a_resumed_run_refuses_leaves_it_as_it_was(pretrained, deployed, tm
         folder = shutil.copytree(run, tmp_path / wrong)
         done = here(name, "--resume", str(folder), wrong)
         assert done.returncode == 2 and wrong.rpartition(".")[2] in done.stderr, done.stderr
-        assert (folder / "config.yaml").read_bytes() == (run / "config.yaml").read_bytes()
+        for kept in ("config.yaml", "summary.json"):
+            assert (folder / kept).read_bytes() == (run / kept).read_bytes()
 
 
 def test_a_checkpoint_that_changed_since_is_said_before_anything_is_driven(pretrained, deployed, tmp_path):

@@ -2,6 +2,8 @@
 
 import csv
 import json
+import resource
+import shutil
 import signal
 from pathlib import Path
 
@@ -11,6 +13,7 @@ from omegaconf import DictConfig
 from safetensors.torch import load_file
 
 from envs.backends.base import BackendError
+from mpc_sgft import deploy as front
 from mpc_sgft.command import compose, resumed
 from mpc_sgft.command.errors import Stopped, UserError
 from mpc_sgft.learning.transfer import Transfer
@@ -192,6 +195,28 @@ def test_what_the_viewer_was_shown_is_taken_back_or_corrected(tmp_path, monkeypa
     assert [text.partition(". ")[2] for text in said if ". " in text] == ["rollout 1", "rollout 1", "rollout 2"]
 
 
+def test_a_finished_run_that_goes_on_has_no_summary_until_it_is_finished_again(tmp_path, monkeypatch):
+    folder, drive = tmp_path / "r", deploy.drive
+
+    def stopped(*args, number: int, **more):
+        if number == 3:
+            raise KeyboardInterrupt
+        return drive(*args, number=number, **more)
+
+    run(folder, None, "rollouts=1", judged=False)
+    before = (folder / "summary.json").read_bytes()
+    with pytest.raises(UserError, match="Give as many or more"):
+        go_on(folder, None, "rollouts=0")
+    assert (folder / "summary.json").read_bytes() == before
+    monkeypatch.setattr(deploy, "drive", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        go_on(folder, None, "rollouts=4")
+    assert not (folder / "summary.json").exists()
+    monkeypatch.setattr(deploy, "drive", drive)
+    for _ in range(2):  # the second time there is nothing left to do
+        assert go_on(folder, None) == json.loads((folder / "summary.json").read_text())
+
+
 def test_what_a_rollout_that_breaks_down_leaves_behind(tmp_path, monkeypatch):
     """The mark of the one before is kept; one that was measured and not learned from is not audited twice."""
     drive, learn = deploy.drive, Transfer.learn
@@ -240,6 +265,21 @@ def test_a_deployment_gives_ctrl_c_back(tmp_path):
     before = signal.getsignal(signal.SIGINT)
     assert deploy.deploy(compose.compose("deploy", [*SMALL, f"run_dir={tmp_path / 'r'}", "rollouts=1"], [])) == 0
     assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_a_resumed_run_that_finds_the_disk_full_says_so_and_gives_ctrl_c_back(plain, tmp_path, capsys):
+    folder, before = shutil.copytree(plain, tmp_path / "r"), signal.getsignal(signal.SIGINT)
+    limit = resource.getrlimit(resource.RLIMIT_FSIZE)
+    for size, file in ((50, "metrics.csv"), ((plain / "metrics.csv").stat().st_size, "config.yaml")):
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size, limit[1]))
+        try:
+            assert front.main(["--resume", str(folder), "rollouts=3"]) == 2
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, limit)
+        said = capsys.readouterr().err
+        assert f"{folder / file}: files may not grow" in said and "the same --resume goes on" in said, said
+        assert signal.getsignal(signal.SIGINT) is before and "run_dir" not in said
+    assert (folder / "summary.json").read_bytes() == (plain / "summary.json").read_bytes()
 
 
 @pytest.mark.parametrize("key", ["rerecord", None])

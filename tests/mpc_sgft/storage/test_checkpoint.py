@@ -123,8 +123,22 @@ def test_safetensors_of_someone_else_and_missing_files(tmp_path):
         checkpoint.load(tmp_path / "other.safetensors")
     with pytest.raises(CheckpointError, match="No checkpoint"):
         checkpoint.load(tmp_path / "nothing")
+    with pytest.raises(CheckpointError, match="No checkpoint at .*/checkpoint/model.safetensors"):
+        checkpoint.load(tmp_path)
     with pytest.raises(CheckpointError, match="No saved state"):
         checkpoint.load_state(tmp_path / "nothing")
+
+
+def test_a_file_that_may_not_be_read_is_not_called_corrupt(tmp_path, monkeypatch):
+    def refused(file, *rest):
+        raise PermissionError(errno.EACCES, "Permission denied", str(file))
+
+    saved(tmp_path / "model.safetensors")
+    checkpoint.save_state(tmp_path / "state.pt", {"round": 1})
+    monkeypatch.setattr("builtins.open", refused)
+    for name, load in (("model.safetensors", checkpoint.load), ("state.pt", checkpoint.load_state)):
+        with pytest.raises(CheckpointError, match=f"{name} cannot be read: Permission denied. Make it readable"):
+            load(tmp_path / name)
 
 
 def test_state_comes_back_and_corruption_is_noticed(tmp_path):

@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
+from mpc_sgft.session.corrections import amend
 from mpc_sgft.storage.episode_file import EpisodeWriter, read_episode
+from mpc_sgft.storage.rollout import Press
 
 METADATA = {"task": "push", "joint_names": ["a", "b"], "seed": 3, "control_dt": 0.2}
 
@@ -54,6 +56,12 @@ def same(episode, steps: int) -> None:
     assert steps or not episode.transitions
 
 
+def plain(episode) -> str:
+    """All that was read, to be compared."""
+    tables = ({k: v.tolist() for k, v in x.items()} for x in (episode.transitions, episode.joints, episode.guided))
+    return json.dumps([*tables, episode.metadata, episode.outcome, episode.keys])
+
+
 def test_round_trip_is_exact(tmp_path):
     write(tmp_path / "0.mcap")
     episode = read_episode(tmp_path / "0.mcap")
@@ -72,6 +80,34 @@ def test_ordinary_mcap_readers_understand_the_file(tmp_path):
         found = [(c.topic, m.log_time, json.loads(m.data)) for _, c, m in make_reader(file).iter_messages()]
     steps = [(log_time, data["step"]) for topic, log_time, data in found if topic == "/transition"]
     assert steps == [(k * 200_000_000, k) for k in range(10)]
+
+
+def test_keys_and_a_takeover_are_stamped_when_they_were(tmp_path):
+    """And an episode that is amended keeps its stamps and counts."""
+
+    def stamps() -> list[tuple[str, float, int]]:
+        with (tmp_path / "0.mcap").open("rb") as file:
+            found = [(c.topic, m.log_time / 1e9, m.sequence) for _, c, m in make_reader(file).iter_messages()]
+        return found[1:]  # metadata
+
+    with EpisodeWriter(tmp_path / "0.mcap", METADATA | {"began_unix": 1000.0}) as writer:
+        for k in range(2):
+            writer.step(transition(k), samples(k))
+        writer.key("takeover", time=0.35, unix=1000.35)
+        for begin in (5.0, 15.0):
+            writer.guided({"time": begin + np.array([0, 0.1])})
+        writer.key("confirm", time=15.05, unix=1015.05)  # while the samples came
+        writer.key("takeover", time=31.0, unix=1031.0)
+        writer.close({})
+    steps = [(topic, 0.2 * k, k) for k in range(2) for topic in ("/transition", "/joints")]
+    person = [("/keys", 0.35, 2), ("/guided", 5.1, 2), ("/guided", 15.1, 2), ("/keys", 15.1, 2)]
+    before = stamps()
+    assert before == [*steps, *person, ("/outcome", 15.1, 2), ("/keys", 31.0, 2)]
+    amend(tmp_path / "0.mcap", [Press("success", 1040.0, 1)], True)
+    assert [stamp for stamp in stamps() if stamp[0] != "/outcome"] == [
+        *(stamp for stamp in before if stamp[0] != "/outcome"),
+        ("/keys", 40.0, 2),
+    ]
 
 
 def test_what_is_not_finite_comes_back_as_nan(tmp_path):
@@ -111,6 +147,8 @@ def test_mistakes_are_named(tmp_path):
         writer.step(transition(0), samples(0))
         with pytest.raises(ValueError, match="camera"):
             writer.step(transition(1) | {"camera": 1})
+        with pytest.raises(ValueError, match="Transition 1 has step=2; steps count from 0"):
+            writer.step(transition(2))
     with pytest.raises(ValueError, match="closed"):
         writer.step(transition(1))
     same(read_episode(tmp_path / "0.mcap"), 1)
@@ -181,6 +219,47 @@ def test_a_flipped_bit_is_reported_and_earlier_steps_kept(tmp_path, part):
     steps = len(episode.transitions["step"])
     assert 0 < steps < 10 and ("damaged" in episode.lost or "middle of a record" in episode.lost)
     same(episode, steps)
+
+
+def test_no_bit_that_flips_goes_unsaid_or_ends_in_another_error(tmp_path):
+    """What is read is all there was, or is told to be less and then begins as the episode did."""
+    path, rng = tmp_path / "0.mcap", np.random.default_rng(0)
+    with EpisodeWriter(path, METADATA) as writer:
+        for k in range(2):
+            writer.step(transition(k), samples(k))
+        writer.key("success", time=0.5, unix=1000.5)
+        writer.guided(samples(2))
+        writer.close({"success": True})
+    whole, good = path.read_bytes(), plain(read_episode(path))
+    index = whole.rindex(b"mpc_sgft.metadata")  # repeated behind the data
+    places = [(at, rng.integers(8)) for at in (*range(index), *range(index, len(whole), 5))]
+    for at, bit in [*places, (whole.rindex(b"/metadata") - 17, 0)]:  # the last makes a message of a channel
+        data = bytearray(whole)
+        data[at] ^= 1 << bit
+        path.write_bytes(data)
+        try:
+            episode = read_episode(path)
+        except ValueError as error:
+            assert "0.mcap is" in str(error) and at < 32, (at, error)  # no MCAP, or none with our topics
+            continue
+        assert not episode.complete or plain(episode) == good, at
+        same(episode, len(episode.transitions.get("step", ())))
+
+
+def test_steps_after_one_that_is_missing_do_not_count(tmp_path):
+    """Where a file was never closed nothing counts what is in it."""
+    path, ends = tmp_path / "0.mcap", []
+    with EpisodeWriter(path, METADATA) as writer:
+        for k in range(4):
+            writer.step(transition(k), samples(k))
+            ends.append(path.stat().st_size)
+        writer.key("success", time=0.5, unix=1000.5)
+        end = path.stat().st_size
+    data = path.read_bytes()
+    path.write_bytes(data[: ends[1]] + data[ends[2] : end])
+    episode = read_episode(path)
+    same(episode, 2)
+    assert "step 2 is missing: 2 whole steps" in episode.lost and [row["key"] for row in episode.keys] == ["success"]
 
 
 def test_a_full_disk_names_the_file_and_keeps_the_steps_before(tmp_path):

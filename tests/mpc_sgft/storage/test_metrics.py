@@ -3,12 +3,15 @@ import io
 import math
 import resource
 import sys
+import threading
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from mpc_sgft.command.errors import UserError
 from mpc_sgft.storage.metrics import GrowingTable, MetricLogger, progress
 
 
@@ -52,6 +55,21 @@ def test_resume_continues_as_if_never_interrupted(tmp_path):
     assert path.read_text() == whole
 
 
+@pytest.mark.parametrize("content", [bytes(50), b"step,loss\n0," + bytes(200_000) + b"\n", b"\x89PNG"])
+def test_what_cannot_be_a_table_is_named_and_kept(tmp_path, content):
+    (tmp_path / "metrics.csv").write_bytes(content)
+    with pytest.raises(UserError, match="metrics.csv is .*Move it away"):
+        MetricLogger(tmp_path, tensorboard=False, resume_step=3)
+    assert (tmp_path / "metrics.csv").read_bytes() == content
+
+
+def test_damaged_rows_are_left_out(tmp_path, capsys):
+    (tmp_path / "metrics.csv").write_bytes(b"step,loss\n0,1.5\n1\n\0\0,2\n\xff,2\n2,0.5\n")
+    MetricLogger(tmp_path, tensorboard=False, resume_step=3).close()
+    assert [row["step"] for row in rows(tmp_path)] == ["0", "2"]
+    assert "metrics.csv: 3 damaged rows are left out" in capsys.readouterr().err
+
+
 def test_a_new_run_does_not_overwrite(tmp_path):
     MetricLogger(tmp_path, tensorboard=False).close()
     with pytest.raises(FileExistsError, match="metrics.csv"):
@@ -67,17 +85,39 @@ def test_values_that_are_no_scalars_are_named(tmp_path):
             logger.log(0, {"step": 1})
 
 
-def test_a_full_disk_names_the_file(tmp_path):
+@contextmanager
+def full_at(size: int):
+    """No file may grow beyond so many bytes, which is what a full disk is to a writer."""
     limit = resource.getrlimit(resource.RLIMIT_FSIZE)
-    logger = MetricLogger(tmp_path, tensorboard=False)
-    logger.log(0, {"loss": 0})
-    resource.setrlimit(resource.RLIMIT_FSIZE, (100, limit[1]))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, limit[1]))
     try:
-        with pytest.raises(OSError, match="metrics.csv"):
-            for step in range(100):
-                logger.log(step, {"loss": 0})
+        yield
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limit)
+
+
+@pytest.mark.parametrize("name", ["loss", "another"])
+def test_a_full_disk_names_the_file(tmp_path, name):
+    logger = MetricLogger(tmp_path, tensorboard=False)
+    logger.log(0, {"loss": 0})
+    with full_at(100), pytest.raises(OSError, match="metrics.csv'"):
+        for step in range(100):
+            logger.log(step, {name if step > 10 else "loss": 0})
+    assert [row["step"] for row in rows(tmp_path)][:11] == ["0", *map(str, range(10))]
+    with full_at(5), pytest.raises(OSError, match="metrics.csv'"):
+        MetricLogger(tmp_path, tensorboard=False, resume_step=9)
+    assert list(tmp_path.iterdir()) == [tmp_path / "metrics.csv"]
+
+
+def test_a_full_disk_names_the_files_of_tensorboard(tmp_path, monkeypatch):
+    monkeypatch.setattr(threading, "excepthook", lambda _: None)  # TensorBoard's own thread ends with it, too
+    others = threading.enumerate()
+    logger = MetricLogger(tmp_path, csv=False)
+    (events,), (worker,) = (tmp_path / "tensorboard").iterdir(), set(threading.enumerate()).difference(others)
+    with full_at(events.stat().st_size + 20), pytest.raises(OSError, match="tensorboard'"):
+        for step in range(100):
+            logger.log(step, {"loss": 0})
+    worker.join(10)
 
 
 def test_tensorboard_has_the_same_numbers(tmp_path):

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from rerun.chunk import RrdReader
 
+from mpc_sgft.command.errors import UserError
 from mpc_sgft.views.blueprint import Layout, camera
 from mpc_sgft.views.episode_view import Candidates, EpisodeView
 from mpc_sgft.views.robot_view import triangles
@@ -260,6 +261,9 @@ def test_a_full_disk_is_an_error_with_the_path(tmp_path):
         with pytest.raises(OSError, match="run.rrd"):
             for k in range(20):
                 viewer.episode(episode(seed=k))
+        resource.setrlimit(resource.RLIMIT_FSIZE, (5000, limit[1]))
+        with pytest.raises(OSError, match="run.rrd'"):  # the place of temporary files is as full
+            RunViewer(tmp_path / "run.rrd", None, control_dt=0.2, resume=True)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limit)
 
@@ -303,9 +307,21 @@ def test_resume_without_anything_to_take_over_starts_a_file(tmp_path, left):
 
 def test_resume_of_a_file_that_is_no_recording_says_so_and_keeps_it(tmp_path):
     (tmp_path / "run.rrd").write_bytes(bytes(range(256)) * 20)
-    with pytest.raises(OSError, match="no rerun recording.*Move it away"):
+    with pytest.raises(UserError, match="no rerun recording.*Move it away"):
         RunViewer(tmp_path / "run.rrd", None, control_dt=0.2, resume=True)
     assert (tmp_path / "run.rrd").read_bytes() == bytes(range(256)) * 20
+
+
+@pytest.mark.parametrize(("begin", "says"), [(12, "damaged: only zeros at byte 12"), (28, r"damaged \(.* run.rrd: ")])
+def test_resume_of_a_file_with_a_hole_names_the_file_and_keeps_it(tmp_path, begin, says):
+    """A power loss may leave zeros in the middle: where a frame begins, or in one."""
+    with RunViewer(tmp_path / "run.rrd", None, control_dt=0.2) as viewer:
+        viewer.episode(episode())
+    data = (tmp_path / "run.rrd").read_bytes()
+    (tmp_path / "run.rrd").write_bytes(data[:begin] + bytes(30) + data[begin + 30 :])
+    with pytest.raises(UserError, match=f"^{tmp_path / 'run.rrd'} is {says}.*Move it away"):
+        RunViewer(tmp_path / "run.rrd", None, control_dt=0.2, resume=True)
+    assert [p.name for p in tmp_path.iterdir()] == ["run.rrd"]
 
 
 def test_colours_go_from_dark_to_light():
