@@ -70,10 +70,10 @@ launcher: setup
 	  || echo "Ray's launcher could not be installed: its test is left out"
 
 test: test-setup ## Set up what the tests need, and run the fast ones.
-	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n $(WORKERS) --dist loadgroup -m "not slow" $(TESTS)
+	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n $(WORKERS) -m "not slow" $(TESTS)
 
 test-all: test-setup ## Run every test, the slow ones too.
-	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n $(WORKERS) --dist loadgroup $(TESTS)
+	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n $(WORKERS) $(TESTS)
 
 docs: setup ## Build the documentation into site/ (strict).
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet

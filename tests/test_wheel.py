@@ -12,8 +12,6 @@ from pathlib import Path
 
 import pytest
 
-pytestmark = pytest.mark.xdist_group("wheel")  # what the file shares is made once
-
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("configs", "envs", "planners", "mpc_sgft")
 

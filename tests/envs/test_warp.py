@@ -6,8 +6,6 @@ import pytest
 warp = pytest.importorskip("warp", reason="needs MuJoCo Warp")
 pytest.importorskip("mujoco_warp", reason="needs MuJoCo Warp")
 
-pytestmark = pytest.mark.xdist_group("warp")  # what the file shares is made once
-
 ENVS = 4
 MM = 1e-3
 

@@ -20,8 +20,6 @@ from envs.stand_in.client import StandIn  # noqa: E402
 from envs.tasks.push import Push  # noqa: E402
 from tools.calibrate_camera import main  # noqa: E402
 
-pytestmark = pytest.mark.xdist_group("record_pairs")  # what the file shares is made once
-
 TESTS = Path(__file__).resolve().parents[1]
 LENS = {"width": 64, "height": 48, "fx": 60.0, "fy": 60.0, "cx": 31.5, "cy": 23.5}
 RED, GREEN = 200, 60  # of every picture; its blue is its number

@@ -34,8 +34,6 @@ from mpc_sgft.views.deploy_view import DeployViewer
 from tests.mpc_sgft.views.test_viewer import columns
 from tools.studies import relearn
 
-pytestmark = pytest.mark.xdist_group("loops")  # what the file shares is made once
-
 TINY = ["+experiment=debug", "task=pendulum", "log.tensorboard=false", "log.rerun=false"]
 NEEDED = "task gap method seed real_rollouts aborted_rollouts zero_shot_success final_success rollouts_to_90".split()
 NEEDED += ["wall_seconds", "rrd"]

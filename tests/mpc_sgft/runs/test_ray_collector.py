@@ -32,8 +32,6 @@ HEAD = (
     "print(ray.get_runtime_context().gcs_address, flush=True)\n"
     "sys.stdin.read()\n"
 )
-pytestmark = pytest.mark.xdist_group("ray_collector")  # what the file shares is made once
-
 CFG = compose.compose("pretrain", ["task=pendulum", "+experiment=debug", "num_envs=5", "device=cpu"], [])
 
 

@@ -25,8 +25,6 @@ from mpc_sgft.storage.episode_file import EpisodeWriter, read_episode
 from mpc_sgft.storage.rollout import Press, from_episode
 from tests.mpc_sgft.views.test_viewer import columns
 
-pytestmark = pytest.mark.xdist_group("verdicts")  # what the file shares is made once
-
 STEPS = 8
 SMALL = [f"task.env.episode_steps={STEPS}", "planner=policy", "method.updates=3", "eval_episodes=2", "quiet=true"]
 SMALL += ["log.tensorboard=false", "log.rerun=false", "train.replay.batch_size=8", "rollouts=2", "method.gate=false"]

@@ -11,8 +11,6 @@ from tools.studies.blind.make import make
 from tools.studies.blind.plants import PLANTS
 from tools.studies.blind.truths import rows
 
-pytestmark = pytest.mark.xdist_group("flaws")  # what the file shares is made once
-
 SLIDE = PLANTS["slide"]
 SCALES = [{"F": 10.0, "V": 0.5, "Q": 0.2, "U": 1.0}]
 SIZES = (3.0, 20.0)
