@@ -84,6 +84,7 @@ def quality() -> str:
     for file, says in (
         ("plan_quality", "As configured, and cheaper:"),
         ("decay", "With fewer candidates after each iteration:"),
+        ("wide", "The same of TD-MPC2's search, beside one ten times as wide as that:"),
         ("early", "Searches that stop early, or follow the spread of plans, and are not used:"),
         ("early_wide", "The same of a wide search:"),
     ):
