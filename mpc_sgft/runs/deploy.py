@@ -3,27 +3,22 @@
 import json
 import sys
 import time
-from collections.abc import Callable
 from contextlib import closing, nullcontext, suppress
-from functools import partial
 from pathlib import Path
 from typing import Any
 
-from hydra.utils import instantiate
 from omegaconf import DictConfig
-from tensordict import TensorDict
 
 from envs.backends.base import BackendError
 from envs.env import ControlEnv
-from mpc_sgft.command.errors import Stopped, UserError, disk_errors, from_config
+from mpc_sgft.command.errors import Stopped, UserError, disk_errors
 from mpc_sgft.learning.agent import Agent
 from mpc_sgft.learning.audit import audit, write_audit
-from mpc_sgft.learning.observation_map import Sensed
-from mpc_sgft.learning.transfer import Transfer, open_loop_error
+from mpc_sgft.learning.transfer import open_loop_error
 from mpc_sgft.learning.world_model import WorldModel
 from mpc_sgft.runs import build, robot
 from mpc_sgft.runs.collect import Score, collect, planner_policy, score, score_of, shown
-from mpc_sgft.runs.explore import explored
+from mpc_sgft.runs.fine_tuning import make_transfer
 from mpc_sgft.runs.pretrain import StopRequest, Stopwatch, evaluation_seed
 from mpc_sgft.runs.real_rollout import begin, drive, start_seed
 from mpc_sgft.session import person
@@ -70,36 +65,6 @@ def deploy(cfg: DictConfig) -> int:
             run.stop.restore()
     print(json.dumps(summary))
     return 0
-
-
-def make_transfer(
-    cfg: DictConfig,
-    agent: Agent,
-    sensed: Sensed,
-    episode_steps: int,
-    simulated: Callable[[int], TensorDict] | None = None,
-) -> Transfer:
-    """A pretrained agent in the hands of `cfg.method`; simulated episodes are those of pretraining, if not given.
-
-    Raises:
-        UserError: For a number that the method refuses, or where it learns and no episode holds one of its slices.
-    """
-    with from_config("method"):
-        method = instantiate(cfg.method, _convert_="all")
-    if method.updates and not 1 <= method.slice_len <= episode_steps:
-        raise UserError(
-            f"method.slice_len={method.slice_len}: an episode of {episode_steps} steps holds no such slice. "
-            f"Give 1 to {episode_steps}."
-        )
-    return Transfer(
-        agent,
-        method,
-        sensed,
-        capacity=(cfg.rollouts + 1) * episode_steps,
-        batch_size=cfg.train.replay.batch_size,
-        seed=cfg.seed,
-        simulated=simulated or partial(explored, cfg, agent.model),
-    )
 
 
 class Deployment:
@@ -175,8 +140,7 @@ class Deployment:
             bar.set_postfix({"real_success": f"{self.state['successes']}/{self.state['rollouts']}"} | paused)
             if self.stop.asked or self.operator.stopping:
                 raise Stopped(self.how_to_go_on())
-        self._before(table)  # without any rollout
-        if self.state["rollouts"] not in self.state["scores"]:  # it was to be longer when the last one was driven
+        if self.state["rollouts"] not in self.state["scores"]:  # none was driven, or it was to be longer by then
             self.evaluate(table, {})
             self.save()
         bar.close()

@@ -107,14 +107,18 @@ class DeployViewer:
             return self._points(model.decode(latents).cpu())
 
 
-@torch.inference_mode()
 def values_on(plane: ValuePlane, model: WorldModel, history: int) -> np.ndarray:
     """V over a plane, at rest with no commands behind it, as large as the plane's grid."""
-    still = np.tile(plane.observation, (1, history + 1))
+    return values_at_rest(plane.observation, model, history).reshape(plane.shape)
+
+
+@torch.inference_mode()
+def values_at_rest(observation: np.ndarray, model: WorldModel, history: int) -> np.ndarray:
+    """V [N] of observations [N, O] that have long been so, with no commands behind them."""
+    still = np.tile(observation, (1, history + 1))
     past = np.zeros((len(still), model.obs_dim - still.shape[1]))
-    observation = torch.from_numpy(np.concatenate([still, past], 1)).float()
-    values = model.terminal_value(model.encode(observation.to(next(model.parameters()).device)))
-    return values.cpu().numpy().reshape(plane.shape)
+    whole = torch.from_numpy(np.concatenate([still, past], 1)).float()
+    return model.terminal_value(model.encode(whole.to(next(model.parameters()).device))).cpu().numpy()
 
 
 def _realised(model: WorldModel, following, reward: np.ndarray, horizon: int, discount: float) -> np.ndarray:

@@ -17,8 +17,8 @@ import torch
 from mpc_sgft.command.compose import compose
 from mpc_sgft.runs import build
 from mpc_sgft.runs.collect import planner_policy
-from mpc_sgft.runs.deploy import make_transfer
 from mpc_sgft.runs.explore import explored
+from mpc_sgft.runs.fine_tuning import make_transfer
 from planners.malloc import keep_freed_memory
 from tools.benchmarks.time_planner import ROOT, cpu_name, seconds
 from tools.studies.runner import write

@@ -19,7 +19,7 @@ from mpc_sgft.command.errors import UserError
 from mpc_sgft.learning.transfer import Transfer
 from mpc_sgft.runs import build
 from mpc_sgft.runs.collect import collect, planner_policy, score
-from mpc_sgft.runs.deploy import make_transfer
+from mpc_sgft.runs.fine_tuning import make_transfer
 from mpc_sgft.runs.pretrain import evaluation_seed
 from mpc_sgft.storage.episode_file import read_episode
 from mpc_sgft.storage.metrics import progress

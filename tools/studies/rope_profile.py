@@ -9,20 +9,22 @@ reality does not allow it, better dynamics show no other way within a few steps.
 """
 
 import argparse
-import csv
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from envs.tasks.over_table import TOP
 from mpc_sgft.api import configure, load_agent, make_env, make_planner
 from mpc_sgft.learning.world_model import WorldModel
 from mpc_sgft.runs.collect import collect, planner_policy
+from mpc_sgft.views.deploy_view import values_at_rest
+from tools.studies.runner import write
 
 BESIDE = 0.025  # [m] of the peg from the hole's middle
 ASIDE = [0.0, 0.05, 0.1, 0.15]  # [m] of the hand from the peg, towards the hole and beyond
 ABOVE = [0.03, 0.08, 0.13, 0.18, 0.23, 0.28, 0.33]  # [m] of the hand over the table
+PROFILE = ["hand_aside_m", "hand_above_m", "to_peg_m", "value"]
+FAILURES = ["peg_beside_m", "peg_above_m", "hand_aside_m", "hand_above_m"]
 SEED = 4_000_000  # shared with no collected and no evaluated episode
 
 
@@ -32,14 +34,10 @@ def profile(model: WorldModel, history: int, half: float, depth: float) -> list[
     hole = np.array([0.5, 0.0, TOP - depth])
     peg = np.array([hole[0] + BESIDE, 0.0, TOP + half])
     hand = np.array([[peg[0] - aside, 0.0, TOP + above] for aside, above in rows])
-    still = np.tile(np.concatenate([hand, np.tile([*peg, *hole], (len(hand), 1))], 1), (1, history + 1))
-    past = np.zeros((len(still), model.obs_dim - still.shape[1]))
-    with torch.inference_mode():
-        observation = torch.from_numpy(np.concatenate([still, past], 1)).float()
-        value = model.terminal_value(model.encode(observation)).tolist()
+    value = values_at_rest(np.concatenate([hand, np.tile([*peg, *hole], (len(hand), 1))], 1), model, history)
     reach = np.linalg.norm(hand - peg - [0.0, 0.0, half], axis=1)
     return [
-        {"hand_aside_m": aside, "hand_above_m": above, "to_peg_m": round(float(far), 3), "value": round(v, 2)}
+        {"hand_aside_m": aside, "hand_above_m": above, "to_peg_m": round(float(far), 3), "value": round(float(v), 2)}
         for (aside, above), far, v in zip(rows, reach, value, strict=True)
     ]
 
@@ -69,17 +67,10 @@ def main() -> None:
     cfg = configure("task=rope_peg_in_hole", f"gap={args.gap}")
     model, env, size = load_agent(cfg).model.eval(), make_env(cfg, args.episodes), cfg.task.env
     data = collect(env, planner_policy(model, make_planner(cfg, model.action_dim), SEED), seed=SEED)["next"][:, -1]
-    found = {
-        "rope.csv": profile(model, cfg.task.history, size.peg_half_height, size.depth),
-        "rope_failures.csv": failures(data["observation"].numpy(), data["success"][:, 0].numpy()),
-    }
-    print(f"{len(found['rope_failures.csv'])} of {args.episodes} fail")
-    args.out.mkdir(parents=True, exist_ok=True)
-    for name, rows in found.items():
-        with (args.out / name).open("w", newline="") as file:
-            writer = csv.DictWriter(file, rows[0].keys() if rows else ["peg_beside_m"])
-            writer.writeheader()
-            writer.writerows(rows)
+    failed = failures(data["observation"].numpy(), data["success"][:, 0].numpy())
+    print(f"{len(failed)} of {args.episodes} fail")
+    write(args.out / "rope.csv", PROFILE, profile(model, cfg.task.history, size.peg_half_height, size.depth))
+    write(args.out / "rope_failures.csv", FAILURES, failed)
 
 
 if __name__ == "__main__":

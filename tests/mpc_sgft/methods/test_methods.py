@@ -16,7 +16,7 @@ from mpc_sgft.learning.method import AbstractMethod
 from mpc_sgft.learning.observation_map import Sensed
 from mpc_sgft.learning.transfer import Transfer
 from mpc_sgft.learning.world_model import WorldModel
-from mpc_sgft.runs.deploy import make_transfer
+from mpc_sgft.runs.fine_tuning import make_transfer
 
 SIZES = {"obs_dim": 6, "action_dim": 1, "decode_dim": 2, "memory_dim": 2, "latent_dim": 16, "mlp_dim": 32}
 SIZES |= {"enc_dim": 32, "num_q": 2}

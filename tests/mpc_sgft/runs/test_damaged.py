@@ -8,7 +8,7 @@ import pytest
 
 from mpc_sgft import deploy as front
 from mpc_sgft.runs import deploy
-from tests.mpc_sgft.session.test_verdicts import rows, run
+from tests.mpc_sgft.session.test_verdicts import broken_at, rows, run
 
 
 class Dead(BaseException):
@@ -18,15 +18,9 @@ class Dead(BaseException):
 @pytest.fixture(scope="module")
 def stopped(tmp_path_factory) -> Path:
     """A run that died when the first of its two rollouts was learned from."""
-    folder, drive = tmp_path_factory.mktemp("runs") / "stopped", deploy.drive
-
-    def dies(*args, number: int, **more):
-        if number == 2:
-            raise Dead
-        return drive(*args, number=number, **more)
-
+    folder = tmp_path_factory.mktemp("runs") / "stopped"
     with pytest.MonkeyPatch.context() as patch, pytest.raises(Dead):
-        patch.setattr(deploy, "drive", dies)
+        patch.setattr(deploy, "drive", broken_at(2, Dead))
         run(folder, None, "rollouts=2", "log.rerun=true")
     return folder
 

@@ -5,6 +5,7 @@ import json
 import resource
 import shutil
 import signal
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -22,7 +23,7 @@ from mpc_sgft.session.corrections import amend
 from mpc_sgft.session.operator import Nobody
 from mpc_sgft.storage import checkpoint
 from mpc_sgft.storage.episode_file import EpisodeWriter, read_episode
-from mpc_sgft.storage.rollout import Press, from_episode
+from mpc_sgft.storage.rollout import Press, Rollout, from_episode
 from tests.mpc_sgft.views.test_viewer import columns
 
 STEPS = 8
@@ -55,6 +56,18 @@ class Script:
     def ask(self) -> bool:
         self.presses.append(Press(self.answers.pop(0), 1e9, self.episode))
         return True
+
+
+def broken_at(last: int, error: type[BaseException], *words: str) -> Callable[..., Rollout]:
+    """`deploy.drive` that breaks down where a rollout begins."""
+    drive = deploy.drive
+
+    def broken(*args, number: int, **more):
+        if number == last:
+            raise error(*words)
+        return drive(*args, number=number, **more)
+
+    return broken
 
 
 def run(folder: Path, operator: Script | None, *more: str, judged: bool = True) -> dict:
@@ -152,13 +165,7 @@ def test_what_is_left_of_a_session_goes_on_with_more_rollouts(tmp_path):
 @pytest.mark.parametrize("judged", [True, False])
 def test_a_run_that_ends_earlier_than_it_was_told_is_measured_at_its_end(tmp_path, monkeypatch, judged):
     drive = deploy.drive
-
-    def broken(*args, number: int, **more):
-        if number == 3:
-            raise RuntimeError("the line is dead")
-        return drive(*args, number=number, **more)
-
-    monkeypatch.setattr(deploy, "drive", broken)
+    monkeypatch.setattr(deploy, "drive", broken_at(3, RuntimeError, "the line is dead"))
     with pytest.raises(RuntimeError, match="the line is dead"):
         run(tmp_path / "r", None, "rollouts=4", "eval_every=4", judged=judged)
     monkeypatch.setattr(deploy, "drive", drive)
@@ -195,18 +202,12 @@ def test_what_the_viewer_was_shown_is_taken_back_or_corrected(tmp_path, monkeypa
 
 def test_a_finished_run_that_goes_on_has_no_summary_until_it_is_finished_again(tmp_path, monkeypatch):
     folder, drive = tmp_path / "r", deploy.drive
-
-    def stopped(*args, number: int, **more):
-        if number == 3:
-            raise KeyboardInterrupt
-        return drive(*args, number=number, **more)
-
     run(folder, None, "rollouts=1", judged=False)
     before = (folder / "summary.json").read_bytes()
     with pytest.raises(UserError, match="Give as many or more"):
         go_on(folder, None, "rollouts=0")
     assert (folder / "summary.json").read_bytes() == before
-    monkeypatch.setattr(deploy, "drive", stopped)
+    monkeypatch.setattr(deploy, "drive", broken_at(3, KeyboardInterrupt))
     with pytest.raises(KeyboardInterrupt):
         go_on(folder, None, "rollouts=4")
     assert not (folder / "summary.json").exists()
@@ -218,13 +219,7 @@ def test_a_finished_run_that_goes_on_has_no_summary_until_it_is_finished_again(t
 def test_what_a_rollout_that_breaks_down_leaves_behind(tmp_path, monkeypatch):
     """The mark of the one before is kept; one that was measured and not learned from is not audited twice."""
     drive, learn = deploy.drive, Transfer.learn
-
-    def broken(*args, number: int, **more):
-        if number == 2:
-            raise RuntimeError("the line is dead")
-        return drive(*args, number=number, **more)
-
-    monkeypatch.setattr(deploy, "drive", broken)
+    monkeypatch.setattr(deploy, "drive", broken_at(2, RuntimeError, "the line is dead"))
     with pytest.raises(RuntimeError, match="the line is dead"):
         run(tmp_path / "r", Script({("resetting", 1): ["success"]}), judged=False)
     assert read_episode(tmp_path / "r" / "episodes" / "0001.mcap").outcome["success"] is True
