@@ -78,9 +78,8 @@ def drive(
             state["action"] = action.clamp(-1, 1)
             row, state = _step(env, state, number, t)
             samples = env.backend.samples()
-            end = (
-                (t + 1) * task.control_dt if samples is None else float(samples["time"][-1])
-            )  # a robot may have waited
+            nominal = (t + 1) * task.control_dt
+            end = nominal if samples is None else float(samples["time"][-1])  # a robot may have waited
             writer.step({**_transition(row, t, end), "note": env.backend.note}, samples)
             listen(writer)
             operator.tell(step=f"{t + 1} of {task.episode_steps}", note=env.backend.note)
